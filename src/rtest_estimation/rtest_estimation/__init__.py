@@ -1,0 +1,1 @@
+"""From gauge readings to the sphere centre and the finished cycle."""

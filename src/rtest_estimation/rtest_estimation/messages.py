@@ -1,0 +1,154 @@
+"""Messages to records, by field name: works on rclpy messages and on those rosbags reads."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from rtest_estimation.records import (
+    Cycle,
+    CyclePlan,
+    CyclePoint,
+    Feedback,
+    GaugeBlock,
+    Kind,
+    Missing,
+    NestCalibration,
+    NestKind,
+)
+
+# A period or a channel count beyond these is a damaged message, not a gauge.
+MAX_CHANNELS = 16
+MAX_PERIOD_S = 3600.0
+
+
+class MessageError(ValueError):
+    """A message whose fields contradict each other; says which and what is expected."""
+
+
+def nanoseconds(stamp: Any) -> int:
+    """`builtin_interfaces/Time` to integer nanoseconds since the epoch."""
+    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
+
+
+def gauge_block(message: Any) -> GaugeBlock:
+    """`rtest_msgs/GaugeSamples` to a `GaugeBlock`.
+
+    Raises MessageError where the array sizes do not fit the number of channels.
+    """
+    channels = int(message.channels)
+    displacement = np.array(message.displacement, dtype=float)
+    status = np.array(message.status, dtype=np.uint8)
+    if not 1 <= channels <= MAX_CHANNELS:
+        raise MessageError(f'GaugeSamples.channels is {channels}, expected 1 to {MAX_CHANNELS}')
+    if displacement.size % channels or status.size != displacement.size or not displacement.size:
+        raise MessageError(
+            f'GaugeSamples has {displacement.size} displacements and {status.size} status values, '
+            f'expected readings x {channels} of each'
+        )
+    period = float(message.period)
+    readings = displacement.size // channels
+    if not 0.0 <= period <= MAX_PERIOD_S or (readings > 1 and period == 0.0):
+        raise MessageError(f'GaugeSamples.period is {period} s with {readings} readings')
+    return GaugeBlock(
+        nanoseconds(message.header.stamp),
+        int(message.sequence),
+        period,
+        displacement.reshape(readings, channels),
+        status.reshape(readings, channels),
+    )
+
+
+def feedback(message: Any) -> Feedback:
+    """`sensor_msgs/JointState` to `Feedback`.
+
+    Raises MessageError where names and positions differ in number.
+    """
+    axes = tuple(str(name) for name in message.name)
+    position = np.array(message.position, dtype=float)
+    if position.shape != (len(axes),) or not axes:
+        raise MessageError(
+            f'JointState has {len(axes)} names and {position.size} positions, expected one each'
+        )
+    return Feedback(nanoseconds(message.header.stamp), axes, position)
+
+
+def cycle_plan(message: Any) -> CyclePlan:
+    """`rtest_msgs/CyclePlan` to a `CyclePlan`.
+
+    Raises MessageError where the plan cannot be measured.
+    """
+    where = f'CyclePlan {message.cycle!r}'
+    axes = tuple(str(axis) for axis in message.axes)
+    commands = np.array(message.commands, dtype=float)
+    if not axes or len(set(axes)) != len(axes):
+        raise MessageError(f'{where}: axes are {list(axes)}, expected distinct letters')
+    if not commands.size or commands.size % len(axes):
+        raise MessageError(
+            f'{where}: {commands.size} commands, expected poses x {len(axes)} axes'
+        )
+    if not np.isfinite(commands).all():
+        raise MessageError(f'{where}: commands hold values that are not finite')
+    try:
+        kind = Kind(int(message.kind))
+    except ValueError:
+        raise MessageError(f'{where}: kind is {message.kind}, expected 0 to 3') from None
+    dwell = float(message.dwell)
+    if not 0.0 <= dwell <= MAX_PERIOD_S:
+        raise MessageError(f'{where}: dwell is {dwell} s, expected 0 to {MAX_PERIOD_S:.0f}')
+    if kind in (Kind.STATIC, Kind.NEST_CALIBRATION) and dwell == 0.0:
+        raise MessageError(f'{where}: dwell is 0 s, a static cycle needs a time to stand still')
+    sphere = np.array([message.sphere.x, message.sphere.y, message.sphere.z], dtype=float)
+    if not np.isfinite(sphere).all():
+        raise MessageError(f'{where}: the sphere position is not finite')
+    return CyclePlan(
+        nanoseconds(message.header.stamp),
+        str(message.session),
+        str(message.cycle),
+        kind,
+        str(message.setup),
+        sphere,
+        axes,
+        commands.reshape(-1, len(axes)),
+        dwell,
+        float(message.feed),
+        str(message.header.frame_id),
+    )
+
+
+def cycle(message: Any) -> Cycle:
+    """`rtest_msgs/Cycle` to a `Cycle`; the reasons of missing poses are not in the message."""
+    points = tuple(
+        CyclePoint(
+            int(point.index),
+            nanoseconds(point.stamp),
+            np.array(point.feedback, dtype=float),
+            np.array(point.approach, dtype=np.int8),
+            np.array([point.displacement.x, point.displacement.y, point.displacement.z]),
+            np.array(point.covariance, dtype=float).reshape(3, 3),
+            int(point.readings),
+        )
+        for point in message.points
+    )
+    missing = tuple(Missing(int(index), 'see /diagnostics') for index in message.missing)
+    return Cycle(
+        cycle_plan(message.plan),
+        points,
+        missing,
+        str(message.calibration),
+        nanoseconds(message.header.stamp),
+    )
+
+
+def nest_calibration(message: Any, setup: str = '') -> NestCalibration:
+    """`rtest_msgs/NestCalibration` to a `NestCalibration`."""
+    return NestCalibration(
+        str(message.calibration),
+        setup,
+        nanoseconds(message.header.stamp),
+        np.array(message.direction, dtype=float).reshape(-1, 3),
+        float(message.residual),
+        float(message.sphere_radius),
+        NestKind(int(message.kind)),
+    )

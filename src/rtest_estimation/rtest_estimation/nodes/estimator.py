@@ -1,0 +1,140 @@
+"""Node `estimator`: gauge readings and encoder feedback in, sphere centres and cycles out."""
+
+from __future__ import annotations
+
+import numpy as np
+from geometry_msgs.msg import PointStamped
+from rclpy.node import Node
+from sensor_msgs.msg import JointState
+from std_srvs.srv import Trigger
+
+from rtest_estimation import messages, nest
+from rtest_estimation.dwell import DwellRules
+from rtest_estimation.nodes import diagnostics, publish
+from rtest_estimation.nodes.qos import LATCHED, LATCHED_100, STREAM
+from rtest_estimation.nodes.run import run
+from rtest_estimation.pipeline import EstimationRules, Estimator, Finished
+from rtest_estimation.records import GaugeBlock, Status
+from rtest_msgs.msg import Cycle, CyclePlan, GaugeSamples, NestCalibration
+
+
+class EstimatorNode(Node):
+    """Wraps `pipeline.Estimator`; everything it knows it got from topics."""
+
+    def __init__(self) -> None:
+        super().__init__('estimator')
+        radius = self.declare_parameter('sphere_radius_mm', 12.7).value
+        settle = self.declare_parameter('settle_s', DwellRules().settle).value
+        # The stream is for eyes and plots; finished cycles use every reading.
+        self._centre_period = 1e9 / self.declare_parameter('sphere_centre_hz', 100.0).value
+        rules = EstimationRules(DwellRules(settle=float(settle)), float(radius) * 1e-3)
+        self._estimator = Estimator(rules)
+        self._centre_due = 0
+        self._damaged: list[str] = []
+        self._last: Finished | None = None
+
+        self._nest = self.create_publisher(NestCalibration, 'rtest/nest', LATCHED)
+        self._centre = self.create_publisher(PointStamped, 'rtest/sphere_centre', STREAM)
+        self._cycle = self.create_publisher(Cycle, 'rtest/cycle', LATCHED_100)
+        self._diagnostics = diagnostics.Diagnostics(self)
+        self.create_subscription(CyclePlan, 'rtest/plan', self._on_plan, LATCHED_100)
+        self.create_subscription(GaugeSamples, 'rtest/gauges', self._on_gauges, STREAM)
+        self.create_subscription(JointState, 'rtest/cnc/feedback', self._on_feedback, STREAM)
+        self.create_service(Trigger, '~/finish', self._on_finish)
+        self.create_timer(1.0, self._report, clock=_wall())
+
+    def _on_plan(self, message: CyclePlan) -> None:
+        self._accept(messages.cycle_plan, message, self._estimator.add_plan)
+
+    def _on_feedback(self, message: JointState) -> None:
+        self._accept(messages.feedback, message, self._estimator.add_feedback)
+
+    def _on_gauges(self, message: GaugeSamples) -> None:
+        self._accept(messages.gauge_block, message, self._add_gauges)
+
+    def _accept(self, convert, message, add) -> None:
+        try:
+            record = convert(message)
+        except messages.MessageError as error:
+            self._damaged.append(str(error))
+            self.get_logger().error(str(error), throttle_duration_sec=1.0)
+            return
+        add(record)
+        self._drain()
+
+    def _add_gauges(self, block: GaugeBlock) -> None:
+        self._estimator.add_gauges(block)
+        calibration = self._estimator.nest
+        if calibration is None or block.displacement.shape[1] != len(calibration.direction):
+            return
+        good = (block.status == Status.VALID).all(axis=1)
+        good &= np.isfinite(block.displacement).all(axis=1)
+        centres = nest.centres(calibration, block.displacement)
+        for stamp, centre in zip(block.stamps[good].tolist(), centres[good], strict=True):
+            if stamp >= self._centre_due:
+                self._centre_due = stamp + int(0.99 * self._centre_period)
+                self._centre.publish(
+                    PointStamped(header=publish.header(stamp, 'table'), point=publish.point(centre))
+                )
+
+    def _drain(self) -> None:
+        while (ready := self._estimator.finished()) is not None:
+            self._publish(ready)
+
+    def _publish(self, ready: Finished) -> None:
+        self._last = ready
+        if ready.nest is not None:
+            self._nest.publish(publish.nest_calibration(ready.nest))
+        self._cycle.publish(publish.cycle(ready.cycle))
+        plan = ready.cycle.plan
+        line = f'{plan.cycle}: {len(ready.cycle.points)} of {len(plan.commands)} poses'
+        level = diagnostics.OK
+        if ready.problem or ready.cycle.missing:
+            level = diagnostics.WARN
+            line += f'; {ready.problem}' if ready.problem else ''
+            self.get_logger().warning(line)
+        reasons = {f'pose {m.index}': m.reason for m in ready.cycle.missing}
+        self._diagnostics.publish(
+            diagnostics.status('estimator: finished cycle', level, line, reasons)
+        )
+
+    def _on_finish(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        for ready in self._estimator.finish():
+            self._publish(ready)
+        response.success = True
+        response.message = f'{len(self._estimator.nests)} nest calibrations'
+        return response
+
+    def _report(self) -> None:
+        progress = self._estimator.progress()
+        values = {'discarded_feedback': self._estimator.discarded, 'damaged': len(self._damaged)}
+        line = 'waiting for a plan'
+        if progress is not None:
+            plan, done = progress
+            values |= {'cycle': plan.cycle, 'poses_done': done, 'poses': len(plan.commands)}
+            line = f'{plan.cycle}: {done} of {len(plan.commands)} poses'
+        level = diagnostics.OK
+        if self._damaged:
+            level, line = diagnostics.WARN, f'damaged message: {self._damaged[-1]}'
+        self._diagnostics.publish(diagnostics.status('estimator: cycle', level, line, values))
+
+    def close(self) -> None:
+        """Publish what is still open when the process is told to stop."""
+        for ready in self._estimator.finish():
+            self._publish(ready)
+
+
+def _wall():
+    """Diagnostics keep coming when the simulated clock stands."""
+    from rclpy.clock import Clock, ClockType
+
+    return Clock(clock_type=ClockType.STEADY_TIME)
+
+
+def main(args: list[str] | None = None) -> int:
+    """Entry point."""
+    return run(EstimatorNode, args)
+
+
+if __name__ == '__main__':
+    raise SystemExit(main())
