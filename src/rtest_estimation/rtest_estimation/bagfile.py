@@ -1,0 +1,166 @@
+"""Finds and reads recordings as they are: closed, killed, cut, damaged, made by others.
+
+Whatever can be read is; the rest is counted and named in `Bag.warnings`. MCAP files are read by
+`McapScan`; other storages (sqlite3, files compressed as a whole) are left to rosbags.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import yaml
+from rosbags.interfaces import MessageDefinitionFormat
+from rosbags.rosbag2 import Reader, ReaderError
+
+from rtest_estimation.errors import UserError
+from rtest_estimation.mcap_scan import McapScan
+from rtest_estimation.message_reader import Definition, full_name, message_reader
+
+
+@dataclass(frozen=True)
+class Bag:
+    """What a recording holds, messages still serialised.
+
+    topics : name to (type, number of messages)
+    size : of the files [bytes]; start, end : first and last log time [ns], 0 in an empty bag
+    closed : whether every file has the index that is written when a recording is closed
+    raw : topic to its messages in file order, each with the definition to read it by
+    """
+
+    path: Path
+    files: tuple[Path, ...]
+    size: int
+    start: int
+    end: int
+    closed: bool
+    topics: dict[str, tuple[str, int]]
+    warnings: tuple[str, ...]
+    raw: dict[str, list[tuple[Definition, bytes]]]
+
+    def messages(self, topic: str) -> Iterator[Any]:
+        """Deserialised messages of a topic, in file order; a `DamagedMessage` for a damaged one.
+
+        Raises UserError where the file does not say what the type looks like.
+        """
+        readers: dict[Definition, Callable[[bytes], Any]] = {}
+        for definition, data in self.raw.get(topic, ()):
+            if definition not in readers:
+                readers[definition] = message_reader(definition, f'{self.path}: topic {topic}')
+            yield readers[definition](data)
+
+
+@dataclass
+class _Contents:
+    """What the files have yielded so far."""
+
+    keep: Collection[str]
+    start: int = 0
+    end: int = 0
+    closed: bool = True
+    types: dict[str, str] = field(default_factory=dict)
+    counts: Counter[str] = field(default_factory=Counter)
+    warnings: list[str] = field(default_factory=list)
+    raw: dict[str, list[tuple[Definition, bytes]]] = field(
+        default_factory=lambda: defaultdict(list)
+    )
+
+    def add(self, topic: str, definition: Definition, log_time: int, data: bytes) -> None:
+        if definition.type_name in self.keep:
+            self.raw[topic].append((definition, data))
+        self.types.setdefault(topic, definition.type_name)
+        self.counts[topic] += 1
+        self.start = log_time if not self.start else min(self.start, log_time)
+        self.end = max(self.end, log_time)
+
+
+def read_bag(path: str | Path, keep: Collection[str]) -> Bag:
+    """Read a bag directory or one of its files.
+
+    keep : message types (``package/msg/Type``) whose messages are kept, the others are counted
+
+    Raises UserError where there is no recording at `path`.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise UserError(f'{path}: no such file or directory; expected a recording')
+    contents = _Contents(keep)
+    try:
+        files, storage = _find_files(path, contents)
+        if storage == 'mcap':
+            for file in files:
+                scan = McapScan(file)
+                for message in scan.messages():
+                    contents.add(*message)
+                contents.closed &= scan.closed
+                contents.warnings += scan.warnings
+        else:
+            _scan_other(files[0].parent, contents)
+        size = sum(file.stat().st_size for file in files)
+    except PermissionError as error:
+        raise UserError(f'{error.filename}: no permission to read it') from error
+    return Bag(
+        path,
+        files,
+        size,
+        contents.start,
+        contents.end,
+        contents.closed,
+        {name: (contents.types[name], contents.counts[name]) for name in contents.types},
+        tuple(contents.warnings),
+        dict(contents.raw),
+    )
+
+
+def _find_files(path: Path, contents: _Contents) -> tuple[tuple[Path, ...], str]:
+    """Files of a recording in order, and their storage: ``mcap`` or ``other``."""
+    if path.name == 'metadata.yaml':
+        path = path.parent
+    if path.is_file():
+        return (path,), 'other' if path.suffix in ('.db3', '.zstd') else 'mcap'
+    listed = _listed_files(path)
+    missing = [name for name in listed if not (path / name).is_file()]
+    if missing:
+        contents.warnings.append(f'{path}/metadata.yaml names {missing[0]}, which is not there')
+    files = [path / name for name in listed if name not in missing]
+    # metadata.yaml can be provisional, gone, or of a bag that was renamed.
+    files = files or sorted(path.glob('*.mcap')) or sorted(path.glob('*.db3'))
+    if not files:
+        inside = sorted(entry.parent.name for entry in path.glob('*/*.mcap'))
+        hint = f'; name one of its recordings: {", ".join(inside[:5])}' if inside else ''
+        raise UserError(f'{path}: no .mcap file in this directory{hint}')
+    return tuple(files), 'mcap' if all(file.suffix == '.mcap' for file in files) else 'other'
+
+
+def _listed_files(folder: Path) -> list[str]:
+    """File names in metadata.yaml; none where it is missing or unreadable."""
+    try:
+        content = yaml.safe_load((folder / 'metadata.yaml').read_text(encoding='utf-8'))
+        listed = content['rosbag2_bagfile_information']['relative_file_paths']
+        # Older versions wrote the directory too; and nobody's metadata leads out of the bag.
+        return [Path(name).name for name in listed]
+    except (FileNotFoundError, UnicodeDecodeError, yaml.YAMLError, KeyError, TypeError):
+        return []
+
+
+def _scan_other(folder: Path, contents: _Contents) -> None:
+    """Read a bag directory of another storage."""
+    forms = {MessageDefinitionFormat.MSG: 'ros2msg', MessageDefinitionFormat.IDL: 'ros2idl'}
+    try:
+        with Reader(folder) as reader:
+            definitions = {
+                (connection.topic, connection.id): Definition(
+                    full_name(connection.msgtype),
+                    forms.get(connection.msgdef.format, ''),
+                    connection.msgdef.data,
+                )
+                for connection in reader.connections
+            }
+            for connection, log_time, data in reader.messages():
+                definition = definitions[connection.topic, connection.id]
+                contents.add(connection.topic, definition, log_time, bytes(data))
+    except (ReaderError, FileNotFoundError) as error:
+        raise UserError(f'{folder}: cannot be read as a recording: {error}') from error

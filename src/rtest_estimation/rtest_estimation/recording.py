@@ -1,0 +1,262 @@
+"""Reads a recorded session for identification at a desk; needs no ROS."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+from rtest_estimation import messages
+from rtest_estimation.bagfile import Bag, read_bag
+from rtest_estimation.errors import UserError
+from rtest_estimation.message_reader import DamagedMessage
+from rtest_estimation.records import CyclePlan, Feedback, GaugeBlock
+from rtest_estimation.sequence import SequenceCheck
+
+# What a recording is read for: message type and the name the graph gives the topic.
+ROLES = {
+    'gauges': ('rtest_msgs/msg/GaugeSamples', 'rtest/gauges'),
+    'feedback': ('sensor_msgs/msg/JointState', 'rtest/cnc/feedback'),
+    'plan': ('rtest_msgs/msg/CyclePlan', 'rtest/plan'),
+    'machine': ('std_msgs/msg/String', 'rtest/machine'),
+    'nest': ('rtest_msgs/msg/NestCalibration', 'rtest/nest'),
+    'cycle': ('rtest_msgs/msg/Cycle', 'rtest/cycle'),
+    'location_errors': ('rtest_msgs/msg/LocationErrors', 'rtest/location_errors'),
+}
+TYPES = frozenset(message_type for message_type, _ in ROLES.values())
+NEEDED = {
+    'gauges': 'gauge readings',
+    'feedback': 'encoder feedback',
+    'plan': 'plan of a cycle',
+}
+# Gaps that a warning lists one by one.
+LISTED_GAPS = 5
+
+Stamped = TypeVar('Stamped', GaugeBlock, Feedback, CyclePlan)
+
+
+@dataclass(frozen=True)
+class Recording:
+    """One recorded session.
+
+    machine_text : YAML of the machine, None where it was not recorded
+    plans, gauges, feedback : in the order of their stamps
+    nests, cycles, location_errors : messages that were published during the session, if any
+    warnings : everything that is missing or damaged, one sentence each
+    topics : name to (type, number of messages), of everything in the file
+    start, end : first and last reception [ns]; size : [bytes]
+    lost : readings missing by their running index
+    closed : whether the recorder could close the file
+    """
+
+    path: Path
+    session: str
+    machine_text: str | None
+    plans: tuple[CyclePlan, ...]
+    gauges: tuple[GaugeBlock, ...]
+    feedback: tuple[Feedback, ...]
+    nests: tuple[Any, ...]
+    cycles: tuple[Any, ...]
+    location_errors: tuple[Any, ...]
+    warnings: tuple[str, ...]
+    topics: dict[str, tuple[str, int]]
+    start: int
+    end: int
+    size: int
+    lost: int = 0
+    closed: bool = True
+
+
+def read_recording(path: str | Path, topics: Mapping[str, str] | None = None) -> Recording:
+    """Read a session from a bag directory or an .mcap file, whole or cut.
+
+    topics : role (key of `ROLES`) to topic name, where the name cannot be found by itself
+
+    Raises UserError where there is no recording, where readings, feedback or plans are missing,
+    and where several topics could be meant.
+    """
+    return recording_of(read_bag(path, TYPES), topics)
+
+
+def recording_of(bag: Bag, topics: Mapping[str, str] | None = None) -> Recording:
+    """The session in a bag that was read with `TYPES`; see `read_recording`."""
+    warnings = list(bag.warnings)
+    chosen = {role: find_topic(bag, role, (topics or {}).get(role)) for role in ROLES}
+    for role, name in NEEDED.items():
+        if chosen[role] is None:
+            message_type, topic = ROLES[role]
+            why = bag.warnings[0] if bag.warnings else 'record the session with this topic'
+            raise UserError(
+                f'{bag.path}: no {name} (topic /{topic}, type {message_type}); {why}'
+            )
+    arrived = _convert(bag, chosen['gauges'], messages.gauge_block, warnings)
+    lost = _check_sequence(arrived, chosen['gauges'], bag.start, warnings)
+    gauges = _in_order(arrived, chosen['gauges'], bag.start, warnings)
+    feedback = _in_order(
+        _convert(bag, chosen['feedback'], messages.feedback, warnings),
+        chosen['feedback'],
+        bag.start,
+        warnings,
+    )
+    plans = _plans(_convert(bag, chosen['plan'], messages.cycle_plan, warnings), warnings)
+    for role, records in (('gauges', gauges), ('feedback', feedback), ('plan', plans)):
+        if not records:
+            raise UserError(
+                f'{bag.path}: no usable {NEEDED[role]} on {chosen[role]}: {warnings[-1]}'
+            )
+    machine = _raw_messages(bag, chosen['machine'], warnings)
+    folder = bag.path if bag.path.is_dir() else bag.path.with_suffix('')
+    return Recording(
+        bag.path,
+        plans[0].session or folder.name,
+        str(machine[-1].data) if machine else None,
+        plans,
+        gauges,
+        feedback,
+        _raw_messages(bag, chosen['nest'], warnings),
+        _raw_messages(bag, chosen['cycle'], warnings),
+        _raw_messages(bag, chosen['location_errors'], warnings),
+        tuple(warnings),
+        bag.topics,
+        bag.start,
+        bag.end,
+        bag.size,
+        lost,
+        bag.closed,
+    )
+
+
+def find_topic(bag: Bag, role: str, name: str | None = None) -> str | None:
+    """Topic of a role (key of `ROLES`): by `name`, by its usual name, by its type.
+
+    Returns None where nothing fits; raises UserError where several do.
+    """
+    message_type, usual = ROLES[role]
+    fitting = [topic for topic, (found, _) in bag.topics.items() if found == message_type]
+    if name is not None:
+        if name not in fitting:
+            raise UserError(
+                f'{bag.path}: no topic {name} of type {message_type} for {role}; '
+                f'there is {", ".join(sorted(fitting)) or "none of this type"}'
+            )
+        return name
+    if role == 'machine':
+        # Any text is a String: under another name it must look like a machine file.
+        fitting = [topic for topic in fitting if _is(topic, usual) or _machine_like(bag, topic)]
+    for candidates in (
+        [topic for topic in fitting if topic == f'/{usual}'],
+        [topic for topic in fitting if _is(topic, usual)],
+        fitting,
+    ):
+        if len(candidates) == 1:
+            return candidates[0]
+        if candidates:
+            raise UserError(
+                f'{bag.path}: {role} could be any of {", ".join(sorted(candidates))}; '
+                f'choose with --topic {role}=NAME'
+            )
+    return None
+
+
+def _is(topic: str, usual: str) -> bool:
+    """Whether a topic has its usual name, in whatever namespace."""
+    return topic.endswith(f'/{usual}')
+
+
+def _machine_like(bag: Bag, topic: str) -> bool:
+    return any(
+        not isinstance(message, DamagedMessage)
+        and all(re.search(rf'^{key}\s*:', message.data, re.MULTILINE) for key in ('chain', 'axes'))
+        for message in bag.messages(topic)
+    )
+
+
+def _convert(
+    bag: Bag, topic: str, convert: Callable[[Any], Stamped], warnings: list[str]
+) -> list[Stamped]:
+    """Records of a topic in order of arrival; damaged messages are counted in a warning."""
+    records: list[Stamped] = []
+    reasons: list[str] = []
+    for message in bag.messages(topic):
+        if isinstance(message, DamagedMessage):
+            reasons.append(message.reason)
+            continue
+        try:
+            record = convert(message)
+        except messages.MessageError as error:
+            reasons.append(str(error))
+            continue
+        if record.stamp <= 0:
+            reasons.append('its time stamp is 0')
+            continue
+        records.append(record)
+    if reasons:
+        warnings.append(f'{topic}: {_plural(len(reasons), "message")} left out ({reasons[0]})')
+    return records
+
+
+def _raw_messages(bag: Bag, topic: str | None, warnings: list[str]) -> tuple[Any, ...]:
+    """Messages of a topic that identification does not need, as they are."""
+    if topic is None:
+        return ()
+    found = tuple(bag.messages(topic))
+    good = tuple(message for message in found if not isinstance(message, DamagedMessage))
+    if len(good) < len(found):
+        warnings.append(f'{topic}: {_plural(len(found) - len(good), "damaged message")} left out')
+    return good
+
+
+def _check_sequence(
+    blocks: Iterable[GaugeBlock], topic: str, start: int, warnings: list[str]
+) -> int:
+    """Count lost readings and name them in a warning."""
+    check = SequenceCheck()
+    gaps = [
+        loss
+        for block in blocks
+        if (loss := check.add(block.stamp, block.sequence, len(block.displacement)))
+    ]
+    if gaps:
+        listed = [f'{gap.count} before {_seconds(gap.stamp, start)}' for gap in gaps[:LISTED_GAPS]]
+        more = f' and {len(gaps) - LISTED_GAPS} more' if len(gaps) > LISTED_GAPS else ''
+        warnings.append(
+            f'{topic}: {_plural(check.lost, "reading")} lost in {_plural(len(gaps), "gap")} '
+            f'({", ".join(listed)}{more})'
+        )
+    if check.restarts:
+        warnings.append(f'{topic}: the driver was restarted {_plural(check.restarts, "time")}')
+    return check.lost
+
+
+def _in_order(
+    records: list[Stamped], topic: str, start: int, warnings: list[str]
+) -> tuple[Stamped, ...]:
+    """Sort by stamp; stamps that step back are named in a warning."""
+    pairs = zip(records, records[1:], strict=False)
+    back = [record for before, record in pairs if record.stamp < before.stamp]
+    if not back:
+        return tuple(records)
+    warnings.append(
+        f'{topic}: stamps step back {_plural(len(back), "time")}, first to '
+        f'{_seconds(back[0].stamp, start)}; sorted'
+    )
+    return tuple(sorted(records, key=lambda record: record.stamp))
+
+
+def _plans(arrived: list[CyclePlan], warnings: list[str]) -> tuple[CyclePlan, ...]:
+    """Plans by stamp; one that was delivered twice (latched topic) counts once."""
+    unique = {(plan.session, plan.cycle, plan.stamp): plan for plan in arrived}
+    sessions = sorted({plan.session for plan in arrived})
+    if len(sessions) > 1:
+        warnings.append(f'plans of several sessions in one recording: {", ".join(sessions)}')
+    return tuple(sorted(unique.values(), key=lambda plan: plan.stamp))
+
+
+def _seconds(stamp: int, start: int) -> str:
+    return f'{(stamp - start) / 1e9:.3f} s'
+
+
+def _plural(count: int, noun: str) -> str:
+    return f'{count} {noun}' if count == 1 else f'{count} {noun}s'

@@ -1,0 +1,307 @@
+"""Location errors and squareness, and the error map of the outer rotary axis.
+
+Location errors (Eq. 3-16) are fitted together with the squareness of the linear axes and an offset
+for every cycle, so that no single zero reading is trusted. The six position-dependent errors of
+the outer rotary axis (B; Eqs. 3-22 and 3-23) are then fitted to what is left, with mean zero over
+the stations. What a constant error explains is never put into the map: of all maps that fit
+equally well the smallest is taken.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import stats
+from scipy.sparse.csgraph import connected_components
+
+from rtest_identification.least_squares import Solution, solve
+from rtest_identification.observations import Observations
+from rtest_identification.symbols import (
+    ErrorParameter,
+    location_parameters,
+    map_parameters,
+    parameter,
+)
+
+# Stations closer than this are one station [rad].
+STATION = 1e-3
+# The map takes part in the location errors where it is there with this significance.
+MAP_SIGNIFICANCE = 0.01
+# A point this improbable under the fit (chi-squared, over all points) is an outlier.
+OUTLIER_PROBABILITY = 1e-4
+_ITERATIONS = 8
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Named values with their covariance (standard uncertainties squared).
+
+    value : (p,) [m] or [rad]; covariance : (p, p)
+    determined : (p,) bool; the value of an undetermined one means nothing
+    freedom : degrees of freedom of the residual the covariance rests on
+    """
+
+    parameters: tuple[ErrorParameter, ...]
+    value: np.ndarray
+    covariance: np.ndarray
+    determined: np.ndarray
+    rank: int
+    condition: float
+    freedom: int
+
+    @property
+    def symbols(self) -> tuple[str, ...]:
+        """Symbols in the order of the values."""
+        return tuple(p.symbol for p in self.parameters)
+
+    @property
+    def stddev(self) -> np.ndarray:
+        """(p,) standard uncertainties."""
+        return np.sqrt(np.diag(self.covariance))
+
+
+@dataclass(frozen=True)
+class AxisMap:
+    """Position-dependent errors of one rotary axis at its stations.
+
+    stations : (s,) [rad]; value, stddev : (6, s) in the order of `parameters` [m] or [rad]
+    covariance : (6 s, 6 s), parameters first
+    left_open : names of shapes that these data do not tell from constant errors
+    significance : probability of a map this large where there is none
+    """
+
+    axis: str
+    parameters: tuple[ErrorParameter, ...]
+    stations: np.ndarray
+    value: np.ndarray
+    covariance: np.ndarray
+    rank: int
+    condition: float
+    left_open: tuple[str, ...]
+    significance: float
+
+    @property
+    def stddev(self) -> np.ndarray:
+        """(6, s) standard uncertainties."""
+        return np.sqrt(np.diag(self.covariance)).reshape(self.value.shape)
+
+
+@dataclass(frozen=True)
+class Fit:
+    """What a session's static cycles give.
+
+    location : location and squareness errors
+    error_map : of the outer rotary axis; None where it has fewer than three stations
+    residual : (n, 3) what the map leaves, frame ``table`` [m]; 0 rows of outliers are left out
+    rms : of the residual per component, corrected for degrees of freedom [m]
+    rms_location : the same with the location errors alone
+    outliers : rows of the observations that were left out
+    joint : whether the location errors were fitted together with the map
+    """
+
+    location: Estimate
+    error_map: AxisMap | None
+    residual: np.ndarray
+    rms: float
+    rms_location: float
+    outliers: np.ndarray
+    joint: bool
+
+
+def fit(observations: Observations) -> Fit:
+    """Identify location errors, squareness and the outer axis's map, leaving outliers out."""
+    rows = np.arange(len(observations))
+    while True:
+        kept = observations.keep(rows)
+        result = _fit(kept)
+        bad = _outliers(result.residual)
+        if not bad.any() or np.sum(~bad) < 0.8 * len(observations):
+            left_out = np.setdiff1d(np.arange(len(observations)), rows)
+            return Fit(**{**vars(result), 'outliers': left_out})
+        rows = rows[~bad]
+
+
+def _fit(observations: Observations) -> Fit:
+    constants = location_parameters(observations.machine)
+    columns = [p.column for p in constants]
+    weights = _Whitening(observations.covariance, 0.0)
+    errors = np.zeros(len(constants))
+    table = np.zeros((len(observations.machine.letters), 6))
+    offsets = observations.offsets()
+    scale = np.concatenate([[p.scale for p in constants], np.ones(offsets.shape[2])])
+    for _ in range(_ITERATIONS):
+        table.flat[columns] = errors
+        predicted, jacobian = observations.predict(table, jacobian=True)
+        design = np.concatenate([jacobian[:, :, columns], offsets], axis=2)
+        left = observations.displacement - predicted
+        first = solve(weights.rows(design), weights.rows(left), scale)
+        change = first.value[: len(errors)]
+        errors = errors + change
+        residual = left - design @ first.value
+        freedom = max(residual.size - first.rank, 1)
+        rms = float(np.sqrt((residual**2).sum() / freedom))
+        weights = _Whitening(observations.covariance, rms)
+        if (np.abs(change / scale[: len(errors)]) <= 1e-12).all():
+            break
+    unit = _variance(weights.rows(residual), freedom)
+    location = _location(constants, errors, first, unit * first.cofactor, freedom)
+    none = np.empty(0, dtype=int)
+    alone = Fit(location, None, residual, rms, rms, none, False)
+    outer = observations.machine.rotary[0] if observations.machine.rotary else None
+    stations, station = _stations(observations.axis(outer)) if outer else (np.empty(0), none)
+    if len(stations) < 3:
+        return alone
+    return _with_map(observations, alone, outer, (stations, station), (design, jacobian, weights))
+
+
+def _with_map(
+    observations: Observations,
+    alone: Fit,
+    axis: str,
+    grid: tuple[np.ndarray, np.ndarray],
+    linear: tuple[np.ndarray, np.ndarray, _Whitening],
+) -> Fit:
+    """Add the map of `axis` to the location errors (Eq. 3-23)."""
+    stations, station = grid
+    design, jacobian, weights = linear
+    parameters = map_parameters(observations.machine, axis)
+    count, size = len(stations), len(design[0, 0])
+    # Unknowns: coordinates in the space of sequences of mean zero over the stations.
+    zero_mean = _zero_mean(count)
+    spread = zero_mean[station]
+    columns = [parameter(observations.machine, axis, p.letter).column for p in parameters]
+    effect = np.einsum('nip,ns->nips', jacobian[:, :, columns], spread)
+    effect = effect.reshape(len(observations), 3, -1)
+    scale = np.repeat([p.scale for p in parameters], count - 1)
+    a, b = weights.rows(design), weights.rows(effect)
+    y = weights.rows(alone.residual)
+    base = _orthonormal(a)
+    free = b - base @ (base.T @ b)
+    second = solve(free, y - base @ (base.T @ y), scale)
+    coordinates = second.value
+    scale_a = np.concatenate(
+        [[p.scale for p in alone.location.parameters], np.ones(size - len(alone.location.value))]
+    )
+    # What the map takes away from the constants: shift of the first solution.
+    shift = solve(a, y - b @ coordinates, scale_a)
+    residual = alone.residual - effect @ coordinates - design @ shift.value
+    freedom = max(residual.size - shift.rank - second.rank, 1)
+    unit = _variance(weights.rows(residual), freedom)
+    before = float((weights.rows(alone.residual) ** 2).sum())
+    after = float((weights.rows(residual) ** 2).sum())
+    f = ((before - after) / max(second.rank, 1)) / (after / freedom) if after > 0 else np.inf
+    significance = float(stats.f.sf(f, second.rank, freedom))
+    turn = np.kron(np.eye(len(parameters)), zero_mean)
+    covariance = turn @ (unit * second.cofactor) @ turn.T
+    value = (turn @ coordinates).reshape(len(parameters), count)
+    error_map = AxisMap(
+        axis, parameters, stations, value, covariance, second.rank, second.condition,
+        _left_open(parameters, turn @ (second.nullspace * scale[:, None])), significance,
+    )
+    rms = float(np.sqrt((residual**2).sum() / freedom))
+    joint = significance < MAP_SIGNIFICANCE
+    location = alone.location
+    if joint:
+        carry = solve(a, b, scale_a).value
+        total = unit * (shift.cofactor + carry @ second.cofactor @ carry.T)
+        values = np.concatenate([location.value, np.zeros(size - len(location.value))])
+        location = _location(
+            location.parameters, (values + shift.value)[: len(location.value)], shift, total,
+            freedom,
+        )
+    return Fit(location, error_map, residual, rms, alone.rms, alone.outliers, joint)
+
+
+def _location(
+    parameters: tuple[ErrorParameter, ...],
+    value: np.ndarray,
+    solution: Solution,
+    covariance: np.ndarray,
+    freedom: int,
+) -> Estimate:
+    count = len(parameters)
+    return Estimate(
+        parameters, value[:count], covariance[:count, :count], solution.determined[:count],
+        solution.rank, solution.condition, freedom,
+    )
+
+
+class _Whitening:
+    """Scales rows to unit variance: scatter of the readings plus what differs between dwells."""
+
+    def __init__(self, covariance: np.ndarray, rms: float) -> None:
+        readings = float(np.trace(covariance, axis1=1, axis2=2).mean()) / 3.0
+        dwell = max(rms**2 - readings, 0.1 * rms**2)
+        if rms == 0.0:
+            covariance, dwell = np.zeros_like(covariance), 1.0
+        total = covariance + dwell * np.eye(3)
+        self.factor = np.linalg.inv(np.linalg.cholesky(total))
+
+    def rows(self, values: np.ndarray) -> np.ndarray:
+        """(n, 3) or (n, 3, p) to whitened (3 n,) or (3 n, p)."""
+        white = np.einsum('nij,nj...->ni...', self.factor, values)
+        return white.reshape(-1, *values.shape[2:])
+
+
+def _variance(white: np.ndarray, freedom: int) -> float:
+    """Variance factor of whitened residuals."""
+    return float((white**2).sum() / freedom)
+
+
+def _orthonormal(design: np.ndarray) -> np.ndarray:
+    u, s, _ = np.linalg.svd(design / np.linalg.norm(design, axis=0), full_matrices=False)
+    return u[:, s > 1e-9 * s[0]]
+
+
+def _zero_mean(count: int) -> np.ndarray:
+    """(count, count - 1) orthonormal basis of the sequences of mean zero (Helmert contrasts)."""
+    basis = np.zeros((count, count - 1))
+    for k in range(1, count):
+        basis[:k, k - 1] = 1.0
+        basis[k, k - 1] = -k
+        basis[:, k - 1] /= np.sqrt(k * (k + 1))
+    return basis
+
+
+def _stations(positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Stations of an axis and, for every row, which one it is at."""
+    order = np.argsort(positions)
+    group = np.concatenate([[0], np.cumsum(np.diff(positions[order]) > STATION)])
+    station = np.empty(len(positions), dtype=int)
+    station[order] = group
+    return np.array([positions[station == g].mean() for g in range(group[-1] + 1)]), station
+
+
+def _left_open(parameters: tuple[ErrorParameter, ...], nullspace: np.ndarray) -> tuple[str, ...]:
+    """Groups of symbols whose shapes over the stations the data do not tell from constants.
+
+    The projector on what is left open couples the symbols that make up one shape; symbols it does
+    not couple are named apart.
+    """
+    if not nullspace.shape[1]:
+        return ()
+    scale = np.repeat([p.scale for p in parameters], len(nullspace) // len(parameters))
+    basis = np.linalg.qr(nullspace / scale[:, None])[0]
+    parts = basis.reshape(len(parameters), -1, basis.shape[1])
+    coupling = np.einsum('ask,btk->asbt', parts, parts)
+    linked = np.sqrt((coupling**2).sum(axis=(1, 3))) > 0.05
+    count, label = connected_components(linked, directed=False)
+    groups = []
+    for group in range(count):
+        members = [i for i in range(len(parameters)) if label[i] == group and linked[i, i]]
+        if members:
+            names = ', '.join(parameters[i].symbol for i in members)
+            shapes = round(sum(float((parts[i] ** 2).sum()) for i in members))
+            groups.append(f'{names} ({shapes} shape{"s" if shapes != 1 else ""})')
+    return tuple(groups)
+
+
+def _outliers(residual: np.ndarray) -> np.ndarray:
+    """(n,) points far from the fit, judged by the robust spread of the others."""
+    sigma = 1.4826 * np.median(np.abs(residual))
+    size = (residual**2).sum(axis=1)
+    # The robust spread is used with a margin, because the model may lack an effect. A gross
+    # outlier pulls its neighbours along: what is small beside the worst is judged without it.
+    limit = 2.0 * stats.chi2.isf(OUTLIER_PROBABILITY / len(residual), 3) * sigma**2
+    return size > max(limit, 0.25 * size.max())

@@ -1,0 +1,108 @@
+"""Node `identifier`: finished cycles in, location errors and error maps out."""
+
+from __future__ import annotations
+
+from rclpy.clock import Clock, ClockType
+from rclpy.node import Node
+from std_msgs.msg import String
+from std_srvs.srv import Trigger
+
+from rtest_estimation import messages
+from rtest_estimation.errors import UserError
+from rtest_estimation.nodes import diagnostics
+from rtest_estimation.nodes.qos import LATCHED, LATCHED_100
+from rtest_estimation.nodes.run import run
+from rtest_estimation.records import Cycle as CycleRecord
+from rtest_estimation.records import Kind
+from rtest_identification.machine import Machine, parse_machine
+from rtest_identification.nodes import publish
+from rtest_identification.pipeline import Identification, identify
+from rtest_msgs.msg import Cycle, ErrorMap, LocationErrors
+
+
+class IdentifierNode(Node):
+    """Identifies anew after every static cycle, with all cycles of the session so far."""
+
+    def __init__(self) -> None:
+        super().__init__('identifier')
+        self._machine: Machine | None = None
+        self._cycles: dict[str, CycleRecord] = {}
+        self._result: Identification | None = None
+        self._problem = 'waiting for the machine'
+        self._location = self.create_publisher(LocationErrors, 'rtest/location_errors', LATCHED)
+        self._map = self.create_publisher(ErrorMap, 'rtest/error_map', LATCHED)
+        self._diagnostics = diagnostics.Diagnostics(self)
+        self.create_subscription(String, 'rtest/machine', self._on_machine, LATCHED)
+        self.create_subscription(Cycle, 'rtest/cycle', self._on_cycle, LATCHED_100)
+        self.create_service(Trigger, '~/finish', self._on_finish)
+        self.create_timer(1.0, self._report, clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+    def _on_machine(self, message: String) -> None:
+        try:
+            self._machine = parse_machine(message.data, 'rtest/machine')
+            self._problem = 'waiting for a static cycle'
+            if any(c.plan.kind is Kind.STATIC for c in self._cycles.values()):
+                self._identify()
+        except UserError as error:
+            self._machine, self._problem = None, str(error)
+            self.get_logger().error(str(error))
+
+    def _on_cycle(self, message: Cycle) -> None:
+        try:
+            cycle = messages.cycle(message)
+        except messages.MessageError as error:
+            self.get_logger().error(f'rtest/cycle: {error}')
+            return
+        if any(c.plan.session != cycle.plan.session for c in self._cycles.values()):
+            self._cycles.clear()
+            self._result = None
+        self._cycles[cycle.plan.cycle] = cycle
+        if cycle.plan.kind is Kind.STATIC:
+            self._identify()
+
+    def _identify(self) -> None:
+        if self._machine is None:
+            return
+        try:
+            result = identify(self._machine, tuple(self._cycles.values()))
+        except UserError as error:
+            self._problem = str(error)
+            self.get_logger().warning(str(error))
+            return
+        self._result, self._problem = result, ''
+        stamp = max(cycle.stamp for cycle in self._cycles.values())
+        self._location.publish(publish.location_errors(result, stamp))
+        for axis_map in result.maps:
+            self._map.publish(publish.error_map(result, axis_map, stamp))
+
+    def _on_finish(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        self._identify()
+        response.success = self._result is not None
+        response.message = self._summary()
+        return response
+
+    def _summary(self) -> str:
+        if self._result is None:
+            return self._problem
+        location = self._result.location
+        return (
+            f'{int(location.determined.sum())} location and squareness errors from '
+            f'{len(self._result.observations)} poses, residual {self._result.fit.rms * 1e6:.2f} um'
+        )
+
+    def _report(self) -> None:
+        warnings = self._result.warnings if self._result else ()
+        level = diagnostics.WARN if warnings or self._problem else diagnostics.OK
+        values = {f'warning {n + 1}': text for n, text in enumerate(warnings)}
+        self._diagnostics.publish(
+            diagnostics.status('identifier: session', level, self._summary(), values)
+        )
+
+
+def main(args: list[str] | None = None) -> int:
+    """Entry point."""
+    return run(IdentifierNode, args)
+
+
+if __name__ == '__main__':
+    raise SystemExit(main())

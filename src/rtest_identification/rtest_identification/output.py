@@ -1,0 +1,103 @@
+"""`identification.json` (schema in the README) and the report beside it."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from pathlib import Path
+from typing import Any
+
+from rtest_identification.location import AxisMap, Estimate
+from rtest_identification.pipeline import Identification, Unused
+from rtest_identification.report import render
+
+
+def as_dict(result: Identification) -> dict[str, Any]:
+    """The identification as JSON data; SI units, numbers unrounded."""
+    location = result.location
+    rotary = [p.axis in result.machine.rotary for p in location.parameters]
+    return {
+        'session': result.session,
+        'machine': result.machine.name,
+        'location_errors': _named(location, rotary),
+        'squareness': _named(location, [not r for r in rotary]),
+        'error_maps': {m.axis: _map(m) for m in result.maps},
+        'residual_rms': result.fit.rms,
+        'residual_rms_location_errors_only': result.fit.rms_location,
+        'noise': _number(result.noise),
+        'degrees_of_freedom': location.freedom,
+        'rank': location.rank,
+        'condition': _number(location.condition),
+        'correlation': {
+            'symbols': list(location.symbols),
+            'covariance': location.covariance.tolist(),
+        },
+        'undetermined': [
+            s for s, good in zip(location.symbols, location.determined, strict=True) if not good
+        ],
+        'runout': None
+        if result.runout is None
+        else {
+            'radius': result.runout.radius,
+            'stddev': math.sqrt(result.runout.covariance[2, 2]),
+            'residual': result.runout.residual,
+        },
+        'fitted_with_map': result.fit.joint,
+        'poses': len(result.observations),
+        'outliers': [_unused(item) for item in result.outliers],
+        'missing': [_unused(item) for item in result.missing],
+        'warnings': list(result.warnings),
+    }
+
+
+def write(result: Identification, out: Path) -> dict[str, Path]:
+    """Write identification.json and report.html into `out`; returns the paths by name.
+
+    Each file appears whole or not at all.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    paths = {'json': out / 'identification.json', 'report': out / 'report.html'}
+    _atomic(paths['json'], json.dumps(as_dict(result), indent=1, allow_nan=False) + '\n')
+    _atomic(paths['report'], render(result, out))
+    return paths
+
+
+def _atomic(path: Path, text: str) -> None:
+    part = path.with_name(path.name + '.part')
+    part.write_text(text, encoding='utf-8')
+    os.replace(part, path)
+
+
+def _named(location: Estimate, chosen: list[bool]) -> dict[str, Any]:
+    stddev = location.stddev
+    return {
+        p.symbol: {
+            'value': float(location.value[i]),
+            'stddev': float(stddev[i]),
+            'unit': p.unit,
+        }
+        for i, p in enumerate(location.parameters)
+        if chosen[i] and location.determined[i]
+    }
+
+
+def _map(error_map: AxisMap) -> dict[str, Any]:
+    symbols = [p.symbol for p in error_map.parameters]
+    return {
+        'b_rad': error_map.stations.tolist(),
+        **dict(zip(symbols, error_map.value.tolist(), strict=True)),
+        'stddev': dict(zip(symbols, error_map.stddev.tolist(), strict=True)),
+        'rank': error_map.rank,
+        'condition': _number(error_map.condition),
+        'significance': error_map.significance,
+        'left_open': list(error_map.left_open),
+    }
+
+
+def _unused(item: Unused) -> dict[str, Any]:
+    return {'cycle': item.cycle, 'pose': item.pose, 'reason': item.reason}
+
+
+def _number(value: float) -> float | None:
+    return float(value) if math.isfinite(value) else None

@@ -1,0 +1,146 @@
+"""Location errors and B map, against a machine of plain matrices that shares no code."""
+
+from copy import deepcopy
+
+import numpy as np
+import pytest
+from independent import NMV, SETUPS, B, noisy, static_cycle
+
+from rtest_estimation.errors import UserError
+from rtest_identification.location import fit
+from rtest_identification.machine import parse_machine
+from rtest_identification.observations import stack
+
+MACHINE = parse_machine(NMV)
+TRUTH = {
+    'E_X(0Y)B': -7.8e-6, 'E_Y(0Y)B': 12.1e-6, 'E_Z(0Y)B': -38e-6, 'E_A(0Y)B': 1.8e-5,
+    'E_B(0Y)B': 4.1e-5, 'E_C(0Y)B': 0.8e-5, 'E_X(0B)C': 5e-6, 'E_A(0B)C': -1.5e-5,
+    'E_A(0Y)Z': -0.1e-5, 'E_B(0X)Z': -0.8e-5, 'E_C(0Y)X': 1.4e-5,
+}
+VALUES = np.array(list(TRUTH.values()))
+
+
+def constant(b, c):
+    errors = {}
+    for symbol, value in TRUTH.items():
+        errors.setdefault(symbol[-1], {})[symbol[2]] = value
+    return errors
+
+
+MAP = {
+    'B': lambda b: 8e-6 * (b**2 - np.mean(B**2)),
+    'Y': lambda b: 2e-6 * np.sin(2 * b),
+}
+
+
+def with_map(b, c):
+    """The constants, and a B map of mean zero over the stations that no constant could show.
+
+    E_B and E_Y are free of shapes that a constant error of C would make ((E_X, E_Z) and
+    (E_A, E_C) along (cos B, -sin B) or (sin B, cos B)).
+    """
+    errors = constant(b, c)
+    errors['B'] = {k: v + MAP.get(k, lambda b: 0.0)(b) for k, v in errors['B'].items()}
+    return errors
+
+
+def cycles(errors_at, setups=tuple(SETUPS), noise=0.0, rng=None):
+    made = [CACHE[errors_at.__name__, s] for s in setups]
+    return [noisy(c, noise, rng) for c in made] if noise else deepcopy(made)
+
+
+CACHE = {(e.__name__, s): static_cycle(s, e) for e in (constant, with_map) for s in SETUPS}
+
+
+def test_noise_free_data_give_the_truth():
+    result = fit(stack(MACHINE, cycles(constant)))
+    assert result.location.symbols == tuple(TRUTH)
+    # Exact kinematics: what is left is rounding, not second-order terms of 1e-9.
+    np.testing.assert_allclose(result.location.value, VALUES, atol=2e-13)
+    assert result.location.rank == 11 + 12
+    assert not len(result.outliers)
+
+
+@pytest.mark.parametrize('errors_at', [constant, with_map])
+def test_stated_intervals_hold_the_truth(errors_at):
+    rng = np.random.default_rng(11)
+    z = []
+    for _ in range(60):
+        location = fit(stack(MACHINE, cycles(errors_at, noise=2.5e-7, rng=rng))).location
+        z.append((location.value - VALUES) / location.stddev)
+    z = np.array(z)
+    # 660 values: 95 % intervals hold 95 % within Monte Carlo error (correlated: about 1.5 %).
+    assert 0.92 < np.mean(np.abs(z) < 1.96) < 0.975
+    assert 0.85 < z.std() < 1.15
+    assert np.abs(z.mean(axis=0)).max() < 4.5 / np.sqrt(60)
+
+
+def test_uncertainty_is_that_of_plain_least_squares_or_better():
+    rng = np.random.default_rng(12)
+    location = fit(stack(MACHINE, cycles(constant, noise=2.5e-7, rng=rng))).location
+    linear = [not p.angular for p in location.parameters]
+    assert location.stddev[linear].max() < 0.03e-6
+    assert location.stddev[np.logical_not(linear)].max() < 0.4e-6
+
+
+def test_the_map_of_b_is_found_within_its_uncertainty():
+    rng = np.random.default_rng(13)
+    result = fit(stack(MACHINE, cycles(with_map, noise=2.5e-7, rng=rng)))
+    found = result.error_map
+    assert result.joint and found.significance < 1e-6
+    np.testing.assert_allclose(found.stations, B, atol=1e-9)
+    for parameter, value, stddev in zip(found.parameters, found.value, found.stddev, strict=True):
+        truth = np.array([MAP.get(parameter.letter, lambda b: 0.0)(b) for b in B])
+        assert np.abs((value - truth) / stddev).max() < 3.8, parameter.symbol
+        assert abs(value.sum()) < 1e-12
+    assert result.rms == pytest.approx(2.5e-7, rel=0.06)
+
+
+def test_what_an_r_test_cannot_see_is_named():
+    found = fit(stack(MACHINE, cycles(constant))).error_map
+    # Shapes of a constant E_X(0B)C, E_Z of C; and of E_A(0B)C, and the yaw of C.
+    assert found.left_open == (
+        'E_X(Y)B, E_Z(Y)B (2 shapes)', 'E_A(Y)B, E_C(Y)B (2 shapes)',
+    )
+    assert found.rank == 36 - 4
+
+
+def test_one_setup_determines_less_and_says_so():
+    centre_only = fit(stack(MACHINE, cycles(constant, ('2a',))))
+    lost = [s for s, d in zip(TRUTH, centre_only.location.determined, strict=True) if not d]
+    # With the sphere on the axis of C nothing tells tilts from shifts of a rigid table.
+    assert {'E_A(0Y)B', 'E_A(0B)C', 'E_A(0Y)Z'} <= set(lost)
+    assert centre_only.location.rank < 11 + 3
+
+
+def test_an_outlier_is_left_out_and_listed():
+    rng = np.random.default_rng(14)
+    data = cycles(constant, noise=2.5e-7, rng=rng)
+    data[1].points[20].displacement[1] += 50e-6
+    result = fit(stack(MACHINE, data))
+    assert result.outliers.tolist() == [86 + 20]
+    z = (result.location.value - VALUES) / result.location.stddev
+    assert np.abs(z).max() < 4
+
+
+def test_sense_minus_one_gives_the_machine_that_turns_backwards():
+    mirrored = parse_machine(NMV.replace('sense: 1', 'sense: -1'))
+    data = cycles(constant)
+    for cycle in data:
+        for point in cycle.points:
+            point.feedback[3:] *= -1
+    result = fit(stack(mirrored, data))
+    np.testing.assert_allclose(result.location.value, VALUES, atol=2e-13)
+
+
+def test_a_machine_with_other_axes_is_refused():
+    with pytest.raises(UserError, match='A'):
+        stack(
+            parse_machine(NMV.replace('  B:', '  A:').replace('[C, B,', '[C, A,')),
+            cycles(constant, ('1a',)),
+        )
+
+
+def test_nothing_measured_is_refused():
+    with pytest.raises(UserError, match='no static cycle'):
+        stack(MACHINE, [])
