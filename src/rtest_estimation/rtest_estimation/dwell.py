@@ -74,18 +74,19 @@ def find_dwells(
     count = len(plan.commands)
     if len(stamps) < 2:
         return [], [Missing(row, 'no encoder feedback') for row in range(count)]
-    absent = [a for a, column in zip(plan.axes, positions.T, strict=True) if np.isnan(column).all()]
+    gone = np.isnan(positions).all(axis=0)
+    absent = [axis for axis, none in zip(plan.axes, gone, strict=True) if none]
     if absent:
         reason = f'the encoder feedback has no axis {", ".join(absent)}'
         return [], [Missing(row, reason) for row in range(count)]
     rotary = np.array([axis in ROTARY_LETTERS for axis in plan.axes])
     near, still = np.where(rotary, rules.near[1], rules.near[0]), _still(rules, rotary)
     gaps = fresh_gap(stamps, rules)
-    lag = max(1, int(round(rules.span * 1e9 / float(np.median(np.diff(stamps))))))
+    lag = max(1, round(rules.span * 1e9 / float(np.median(np.diff(stamps)))))
     runs = _standing(stamps, positions, still, gaps, lag)
     matched = _match(plan.commands, positions, runs, near)
     dwells, missing = [], []
-    planned = int(round(plan.dwell * 1e9))
+    planned = round(plan.dwell * 1e9)
     for row in range(count):
         if row not in matched:
             missing.append(Missing(row, _why_absent(row, matched, runs, stamps, gaps)))

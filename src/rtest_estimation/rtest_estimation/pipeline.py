@@ -7,13 +7,15 @@ what the node published.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from rtest_estimation import nest as nests
-from rtest_estimation.average import NoAverageError, average
-from rtest_estimation.dwell import ROTARY_LETTERS, Dwell, DwellRules, find_dwells, trailing
+from rtest_estimation.average import Average, NoAverageError, average
+from rtest_estimation.buffers import FeedbackBuffer, GaugeBuffer
+from rtest_estimation.cycle_end import CycleEnd
+from rtest_estimation.dwell import ROTARY_LETTERS, Dwell, DwellRules, find_dwells
 from rtest_estimation.records import (
     Cycle,
     CyclePlan,
@@ -38,7 +40,7 @@ MAX_SCATTER = 20e-6
 class EstimationRules:
     """Parameters of the estimation; sphere_radius [m] is passed on to the calibration."""
 
-    dwell: DwellRules = DwellRules()
+    dwell: DwellRules = field(default_factory=DwellRules)
     sphere_radius: float = float('nan')
 
 
@@ -62,9 +64,9 @@ class Estimator:
         self.rules = rules or EstimationRules()
         self.nests: dict[str, NestCalibration] = {}
         self._plans: list[CyclePlan] = []
-        self._feedback = _Series()
-        self._gauges = _Blocks()
-        self._end = _CycleEnd(self.rules.dwell)
+        self._feedback = FeedbackBuffer()
+        self._gauges = GaugeBuffer()
+        self._end = CycleEnd(self.rules.dwell)
         self.discarded = 0
 
     @property
@@ -82,8 +84,7 @@ class Estimator:
 
     def add_plan(self, plan: CyclePlan) -> None:
         """A cycle begins at the plan's stamp; it ends the one before where that is still open."""
-        same = next((p for p in self._plans if (p.cycle, p.stamp) == (plan.cycle, plan.stamp)), None)
-        if same is None:
+        if (plan.cycle, plan.stamp) not in [(p.cycle, p.stamp) for p in self._plans]:
             self._plans.append(plan)
             self._plans.sort(key=lambda p: p.stamp)
             self._end.reset()
@@ -93,11 +94,13 @@ class Estimator:
         if not self._feedback.append(sample):
             self.discarded += 1
         elif not self._plans and sample.stamp - self._feedback.first > 2 * KEEP_BEFORE_PLAN_NS:
-            self._forget(sample.stamp - KEEP_BEFORE_PLAN_NS)
+            self._feedback.forget(sample.stamp - KEEP_BEFORE_PLAN_NS)
 
     def add_gauges(self, block: GaugeBlock) -> None:
         """Gauge readings, one message's worth."""
         self._gauges.append(block)
+        if not self._plans and block.stamp - self._gauges.first > 2 * KEEP_BEFORE_PLAN_NS:
+            self._gauges.forget(block.stamp - KEEP_BEFORE_PLAN_NS)
 
     def finished(self) -> Finished | None:
         """The next cycle whose data are complete, or None."""
@@ -201,7 +204,10 @@ class Estimator:
         self._gauges.forget(before)
 
 
-def _mean(dwell: Dwell, data: tuple[np.ndarray, np.ndarray, np.ndarray], needed: int):
+def _mean(
+    dwell: Dwell, data: tuple[np.ndarray, np.ndarray, np.ndarray], needed: int
+) -> Average:
+    """Mean of the readings of a dwell; NoAverageError also where they scatter too much."""
     times, displacement, status = data
     used = slice(*np.searchsorted(times, [dwell.start, dwell.end + 1]))
     mean = average(displacement[used], status[used], needed)
@@ -242,132 +248,3 @@ def _points(
         reset = points[0].displacement
         points = [replace(p, displacement=p.displacement - reset) for p in points]
     return tuple(points), tuple(sorted(lost, key=lambda m: m.index))
-
-
-class _Series:
-    """Encoder feedback in order of acquisition."""
-
-    def __init__(self) -> None:
-        self.stamps: list[int] = []
-        self.samples: list[Feedback] = []
-
-    def __len__(self) -> int:
-        return len(self.stamps)
-
-    @property
-    def first(self) -> int:
-        return self.stamps[0] if self.stamps else 0
-
-    @property
-    def last(self) -> int:
-        return self.stamps[-1] if self.stamps else 0
-
-    def append(self, sample: Feedback) -> bool:
-        if self.stamps and sample.stamp <= self.stamps[-1]:
-            return False
-        self.stamps.append(sample.stamp)
-        self.samples.append(sample)
-        return True
-
-    def window(self, plan: CyclePlan, start: int, end: int) -> tuple[np.ndarray, np.ndarray]:
-        """Stamps and positions in the plan's axes; NaN for an axis the feedback does not have."""
-        stamps = np.array(self.stamps, dtype=np.int64)
-        low, high = np.searchsorted(stamps, [start, end + 1])
-        positions = np.full((high - low, len(plan.axes)), np.nan)
-        order: dict[tuple[str, ...], tuple[list[int], list[int]]] = {}
-        for row, sample in enumerate(self.samples[low:high]):
-            if sample.axes not in order:
-                pairs = [
-                    (column, sample.axes.index(axis))
-                    for column, axis in enumerate(plan.axes)
-                    if axis in sample.axes
-                ]
-                order[sample.axes] = ([to for to, _ in pairs], [of for _, of in pairs])
-            to, of = order[sample.axes]
-            positions[row, to] = sample.position[of]
-        finite = np.isfinite(positions)
-        # A column that is never there is reported as a whole; single bad samples are left out.
-        good = finite[:, finite.any(axis=0)].all(axis=1)
-        return stamps[low:high][good], positions[good]
-
-    def forget(self, before: int) -> None:
-        keep = int(np.searchsorted(np.array(self.stamps, dtype=np.int64), before))
-        del self.stamps[:keep], self.samples[:keep]
-
-
-class _Blocks:
-    """Gauge readings in order of acquisition."""
-
-    def __init__(self) -> None:
-        self.blocks: list[GaugeBlock] = []
-        self.last = 0
-
-    def append(self, block: GaugeBlock) -> None:
-        self.blocks.append(block)
-        self.last = max(self.last, int(block.stamps[-1]))
-
-    def window(self, start: int, end: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Stamps (n,), displacement and status (n, channels) of the readings in [start, end]."""
-        blocks = [b for b in self.blocks if b.stamp <= end and b.stamps[-1] >= start]
-        if not blocks:
-            return np.empty(0, dtype=np.int64), np.empty((0, 0)), np.empty((0, 0), dtype=np.uint8)
-        channels = blocks[-1].displacement.shape[1]
-        blocks = [b for b in blocks if b.displacement.shape[1] == channels]
-        times = np.concatenate([b.stamps for b in blocks])
-        order = np.argsort(times, kind='stable')
-        order = order[(times[order] >= start) & (times[order] <= end)]
-        displacement = np.concatenate([b.displacement for b in blocks])[order]
-        return times[order], displacement, np.concatenate([b.status for b in blocks])[order]
-
-    def forget(self, before: int) -> None:
-        self.blocks = [b for b in self.blocks if b.stamps[-1] >= before]
-
-
-class _CycleEnd:
-    """Finds when a cycle is over: its last pose was stood at for the dwell, or the next began."""
-
-    def __init__(self, rules: DwellRules) -> None:
-        self.rules = rules
-        self.reset()
-
-    def reset(self) -> None:
-        self._seen = 0
-        self._since: int | None = None
-        self._tried: int | None = None
-
-    def find(self, plan: CyclePlan, feedback: _Series, limit: int | None) -> int | None:
-        """End of the cycle [ns], or None while it is going on. Looks at new samples only."""
-        rotary = [axis in ROTARY_LETTERS for axis in plan.axes]
-        near = [self.rules.near[turns] for turns in rotary]
-        last = plan.commands[-1]
-        start = max(self._seen, int(np.searchsorted(feedback.stamps, plan.stamp)))
-        for number in range(start, len(feedback)):
-            sample = feedback.samples[number]
-            if limit is not None and sample.stamp >= limit:
-                return limit
-            self._seen = number + 1
-            if not _there(plan.axes, sample, last, near):
-                self._since = None
-                continue
-            if self._since is None:
-                self._since = sample.stamp
-            # Arrival is seen before the axes stand still; half a second covers the difference.
-            end = self._since + int((trailing(plan) * plan.dwell + 0.5) * 1e9)
-            if sample.stamp >= end and self._tried != self._since:
-                self._tried = self._since
-                stamps, positions = feedback.window(plan, plan.stamp, end)
-                dwells, missing = find_dwells(plan, stamps, positions, self.rules)
-                reached = {d.index for d in dwells}
-                done = len(plan.commands) - 1 in reached
-                if done and (plan.kind is not Kind.DYNAMIC) and (len(reached) > 1 or not missing):
-                    return end
-        return None
-
-
-def _there(axes: tuple[str, ...], sample: Feedback, last: np.ndarray, near: list[float]) -> bool:
-    """Whether a sample is at the last pose."""
-    for axis, command, tolerance in zip(axes, last, near, strict=True):
-        if axis in sample.axes:
-            if not abs(sample.position[sample.axes.index(axis)] - command) <= tolerance:
-                return False
-    return True

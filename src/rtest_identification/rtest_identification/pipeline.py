@@ -74,7 +74,7 @@ def identify(machine: Machine, cycles: Sequence[Cycle]) -> Identification:
             warnings.append(f'{turned[-1].plan.cycle}: sphere run-out not used: {error}')
     if runout is None:
         warnings.append(
-            'the sphere\'s run-out against the spindle was not measured: the position errors of '
+            "the sphere's run-out against the spindle was not measured: the position errors of "
             'the rotary axes across the spindle contain it'
         )
     observations = stack(replace(machine, tool=machine.tool + offset), cycles)
@@ -121,9 +121,10 @@ def _with_runout(observations: Observations, result: Fit, runout: runouts.Runout
     """Carry the uncertainty of the sphere's offset to the location errors."""
     step = 1e-6
     slopes = []
+    machine = observations.machine
     for direction in np.eye(3)[:2]:
-        machine = observations.machine
-        moved = replace(observations, machine=replace(machine, tool=machine.tool + step * direction))
+        shifted = replace(machine, tool=machine.tool + step * direction)
+        moved = replace(observations, machine=shifted)
         slopes.append((fit(moved).location.value - result.location.value) / step)
     gain = np.array(slopes).T
     covariance = result.location.covariance + gain @ runout.covariance[:2, :2] @ gain.T
@@ -151,9 +152,9 @@ def _judge(result: Fit, noise: float, freedom: int) -> list[str]:
         if stats.f.sf(ratio, location.freedom, freedom) < MISFIT_PROBABILITY:
             warnings.append(
                 f'residual {result.rms * 1e6:.2f} um against a repeatability of '
-                f'{noise * 1e6:.2f} um: the model lacks an effect (or the machine repeats less well '
-                'elsewhere than at the nest calibration); the values may be off by more than '
-                'their stated uncertainty'
+                f'{noise * 1e6:.2f} um: the model lacks an effect (or the machine repeats less '
+                'well elsewhere than at the nest calibration); the values may be off by more '
+                'than their stated uncertainty'
             )
     if not freedom:
         warnings.append('no repeated poses: the residual cannot be judged against the noise')

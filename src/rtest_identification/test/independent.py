@@ -73,7 +73,7 @@ def static_cycle(setup, errors_at, b=B, c=C):
         poses += [(level, station) for station in (c if row % 2 == 0 else c[::-1])]
     poses.append((0.0, 0.0))
     rows, points = [], []
-    for index, (level, station) in enumerate(poses):
+    for level, station in poses:
         r = (turn('B', level) @ turn('C', station) @ [*sphere, 1])[:3]
         row = np.array([*r, level, station])
         rows.append(row)

@@ -7,6 +7,7 @@ from rtest_estimation.errors import UserError
 from rtest_identification.machine import load_machine, parse_machine
 from rtest_identification.symbols import location_parameters, map_parameters
 
+
 def test_sides_go_from_the_bed_outwards():
     machine = parse_machine(NMV)
     assert machine.table_side == ('B', 'C')

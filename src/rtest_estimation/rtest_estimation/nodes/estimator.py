@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 from geometry_msgs.msg import PointStamped
+from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
+from rtest_msgs.msg import Cycle, CyclePlan, GaugeSamples, NestCalibration
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
@@ -15,7 +20,6 @@ from rtest_estimation.nodes.qos import LATCHED, LATCHED_100, STREAM
 from rtest_estimation.nodes.run import run
 from rtest_estimation.pipeline import EstimationRules, Estimator, Finished
 from rtest_estimation.records import GaugeBlock, Status
-from rtest_msgs.msg import Cycle, CyclePlan, GaugeSamples, NestCalibration
 
 
 class EstimatorNode(Node):
@@ -41,7 +45,8 @@ class EstimatorNode(Node):
         self.create_subscription(GaugeSamples, 'rtest/gauges', self._on_gauges, STREAM)
         self.create_subscription(JointState, 'rtest/cnc/feedback', self._on_feedback, STREAM)
         self.create_service(Trigger, '~/finish', self._on_finish)
-        self.create_timer(1.0, self._report, clock=_wall())
+        # On the wall clock: diagnostics keep coming when the simulated clock stands.
+        self.create_timer(1.0, self._report, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def _on_plan(self, message: CyclePlan) -> None:
         self._accept(messages.cycle_plan, message, self._estimator.add_plan)
@@ -52,7 +57,9 @@ class EstimatorNode(Node):
     def _on_gauges(self, message: GaugeSamples) -> None:
         self._accept(messages.gauge_block, message, self._add_gauges)
 
-    def _accept(self, convert, message, add) -> None:
+    def _accept(
+        self, convert: Callable[[Any], Any], message: Any, add: Callable[[Any], None]
+    ) -> None:
         try:
             record = convert(message)
         except messages.MessageError as error:
@@ -73,9 +80,8 @@ class EstimatorNode(Node):
         for stamp, centre in zip(block.stamps[good].tolist(), centres[good], strict=True):
             if stamp >= self._centre_due:
                 self._centre_due = stamp + int(0.99 * self._centre_period)
-                self._centre.publish(
-                    PointStamped(header=publish.header(stamp, 'table'), point=publish.point(centre))
-                )
+                header = publish.header(stamp, 'table')
+                self._centre.publish(PointStamped(header=header, point=publish.point(centre)))
 
     def _drain(self) -> None:
         while (ready := self._estimator.finished()) is not None:
@@ -122,13 +128,6 @@ class EstimatorNode(Node):
         """Publish what is still open when the process is told to stop."""
         for ready in self._estimator.finish():
             self._publish(ready)
-
-
-def _wall():
-    """Diagnostics keep coming when the simulated clock stands."""
-    from rclpy.clock import Clock, ClockType
-
-    return Clock(clock_type=ClockType.STEADY_TIME)
 
 
 def main(args: list[str] | None = None) -> int:

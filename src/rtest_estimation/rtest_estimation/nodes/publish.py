@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Point
+from rtest_msgs import msg
 from std_msgs.msg import Header
 
 from rtest_estimation.records import Cycle, CyclePlan, NestCalibration
-from rtest_msgs import msg
 
 
 def time(nanoseconds: int) -> Time:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
+from rtest_msgs.msg import Cycle, ErrorMap, LocationErrors
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
@@ -17,7 +18,6 @@ from rtest_estimation.records import Kind
 from rtest_identification.machine import Machine, parse_machine
 from rtest_identification.nodes import publish
 from rtest_identification.pipeline import Identification, identify
-from rtest_msgs.msg import Cycle, ErrorMap, LocationErrors
 
 
 class IdentifierNode(Node):

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
+from rtest_msgs import msg
 
 from rtest_estimation.nodes.publish import header
 from rtest_identification.location import AxisMap
 from rtest_identification.pipeline import Identification
-from rtest_msgs import msg
 
 
 def location_errors(result: Identification, stamp: int) -> msg.LocationErrors:

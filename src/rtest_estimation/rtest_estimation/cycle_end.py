@@ -1,0 +1,62 @@
+"""When a cycle is over, seen from the encoder feedback alone."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rtest_estimation.buffers import FeedbackBuffer
+from rtest_estimation.dwell import ROTARY_LETTERS, DwellRules, find_dwells, trailing
+from rtest_estimation.records import CyclePlan, Feedback, Kind
+
+# Arrival is seen before the axes stand still; this covers the difference [s].
+ARRIVAL = 0.5
+
+
+class CycleEnd:
+    """Finds when a cycle is over: its last pose was stood at for the dwell, or the next began."""
+
+    def __init__(self, rules: DwellRules) -> None:
+        self.rules = rules
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin anew, for another cycle."""
+        self._seen = 0
+        self._since: int | None = None
+        self._tried: int | None = None
+
+    def find(self, plan: CyclePlan, feedback: FeedbackBuffer, limit: int | None) -> int | None:
+        """End of the cycle [ns], or None while it is going on. Looks at new samples only."""
+        rotary = [axis in ROTARY_LETTERS for axis in plan.axes]
+        near = [self.rules.near[turns] for turns in rotary]
+        last = plan.commands[-1]
+        start = max(self._seen, int(np.searchsorted(feedback.stamps, plan.stamp)))
+        for number in range(start, len(feedback)):
+            sample = feedback.samples[number]
+            if limit is not None and sample.stamp >= limit:
+                return limit
+            self._seen = number + 1
+            if not _there(plan.axes, sample, last, near):
+                self._since = None
+                continue
+            if self._since is None:
+                self._since = sample.stamp
+            end = self._since + int((trailing(plan) * plan.dwell + ARRIVAL) * 1e9)
+            if sample.stamp >= end and self._tried != self._since:
+                self._tried = self._since
+                stamps, positions = feedback.window(plan, plan.stamp, end)
+                dwells, missing = find_dwells(plan, stamps, positions, self.rules)
+                reached = {d.index for d in dwells}
+                done = len(plan.commands) - 1 in reached
+                if done and (plan.kind is not Kind.DYNAMIC) and (len(reached) > 1 or not missing):
+                    return end
+        return None
+
+
+def _there(axes: tuple[str, ...], sample: Feedback, last: np.ndarray, near: list[float]) -> bool:
+    """Whether a sample is at the last pose."""
+    for axis, command, tolerance in zip(axes, last, near, strict=True):
+        off = axis in sample.axes and abs(sample.position[sample.axes.index(axis)] - command)
+        if off is not False and not off <= tolerance:
+            return False
+    return True

@@ -1,0 +1,191 @@
+"""Finished cycles: the right centres, whatever the interleaving; missing poses with a reason."""
+
+import random
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from synthetic import T0, displacement, nest_plan, run, session, static_plan
+
+from rtest_estimation.pipeline import Estimator
+from rtest_estimation.records import Kind
+
+
+def estimate(plans, feedback, blocks, shuffle=None):
+    """Feed the three topics in order within each topic, interleaved as `shuffle` says."""
+    estimator = Estimator()
+    queues = [
+        [(estimator.add_plan, p) for p in plans],
+        [(estimator.add_feedback, f) for f in feedback],
+        [(estimator.add_gauges, b) for b in blocks],
+    ]
+    if shuffle is None:
+        items = queues[0] + sorted(queues[1] + queues[2], key=lambda i: i[1].stamp)
+    else:
+        items = sorted(queues[0] + queues[1] + queues[2], key=lambda i: i[1].stamp)
+        late = random.Random(shuffle)
+        # Each topic is late by its own, changing amount, up to 1.5 s.
+        lag = {q[0][0].__name__: 0.0 for q in queues}
+        keyed = []
+        for add, record in items:
+            name = add.__name__
+            lag[name] = max(lag[name], record.stamp + late.random() * 1.5e9)
+            keyed.append((lag[name], add, record))
+        items = [(add, record) for _, add, record in sorted(keyed, key=lambda k: k[0])]
+    done = []
+    for add, record in items:
+        add(record)
+        while (ready := estimator.finished()) is not None:
+            done.append(ready)
+    return done + estimator.finish()
+
+
+def numbers(done):
+    return [
+        (c.cycle.plan.cycle, p.index, p.stamp, *p.feedback, *p.approach, *p.displacement,
+         *p.covariance.ravel(), p.readings)
+        for c in done
+        for p in c.cycle.points
+    ]
+
+
+def test_centres_are_the_displacements_made():
+    plans = session()
+    done = estimate(plans, *run(plans))
+    assert [d.cycle.plan.cycle for d in done] == ['1a-nest', '1a-static']
+    assert done[0].nest is not None and done[0].nest.residual < 2e-7
+    cycle = done[1].cycle
+    assert not cycle.missing and cycle.calibration == 's/1a-nest'
+    for point in cycle.points:
+        wanted = displacement(plans[1], point.index)
+        np.testing.assert_allclose(point.displacement, wanted, atol=2.5e-7)
+        assert point.readings >= 10
+        assert plans[1].stamp <= point.stamp <= cycle.stamp
+
+
+@pytest.mark.parametrize('seed', range(5))
+def test_the_interleaving_of_the_topics_changes_no_bit(seed):
+    plans = session(('1a', '1b'))
+    feedback, blocks = run(plans)
+    assert numbers(estimate(plans, feedback, blocks, seed)) == numbers(
+        estimate(plans, feedback, blocks)
+    )
+
+
+def test_waiting_at_the_last_pose_changes_no_bit():
+    # The second run starts its next plan late; the machine stands at the last pose meanwhile.
+    plans = session()
+    short = estimate(plans, *run(plans, wait=1.0, noise=0.0))
+    feedback, blocks = run(plans, wait=4.0, noise=0.0)
+    assert [row[:3] for row in numbers(short)] == [
+        row[:3] for row in numbers(estimate(plans, feedback, blocks))
+    ]
+
+
+def test_four_gauges_and_one_that_fails():
+    plans = session()
+    feedback, blocks = run(plans, channels=4)
+    start = plans[1].stamp
+    blocks = [
+        replace(b, status=np.where(np.arange(4) == 3, 2, b.status).astype(np.uint8))
+        if b.stamp > start + 1_000_000_000 else b
+        for b in blocks
+    ]
+    cycle = estimate(plans, feedback, blocks)[1].cycle
+    assert not cycle.missing
+    for point in cycle.points:
+        np.testing.assert_allclose(
+            point.displacement, displacement(plans[1], point.index), atol=3e-7
+        )
+    assert cycle.points[0].disagreement > 0.0
+    assert cycle.points[-1].disagreement == 0.0
+
+
+@pytest.mark.parametrize(
+    ('spoil', 'words'),
+    [
+        (lambda b: replace(b, displacement=b.displacement * np.nan), 'not a finite number'),
+        (lambda b: replace(b, status=b.status + np.uint8(1)), 'out of range'),
+        (lambda b: None, 'no gauge readings'),
+    ],
+)
+def test_bad_readings_at_one_pose_cost_that_pose_only(spoil, words):
+    plans = session()
+    feedback, blocks = run(plans)
+    begin = plans[1].stamp + 600_000_000  # pose 1 is reached 0.6 s after the start
+    spoilt = [spoil(b) if begin <= b.stamp < begin + 300_000_000 else b for b in blocks]
+    cycle = estimate(plans, feedback, [b for b in spoilt if b is not None])[1].cycle
+    assert [m.index for m in cycle.missing] == [1]
+    assert words in cycle.missing[0].reason
+    assert len(cycle.points) == 5
+
+
+def test_silent_gauges_do_not_stop_the_session():
+    plans = session(('1a', '1b'))
+    feedback, blocks = run(plans)
+    quiet = [b for b in blocks if not plans[1].stamp <= b.stamp < plans[2].stamp]
+    done = estimate(plans, feedback, quiet)
+    assert len(done) == 4
+    assert {m.reason for m in done[1].cycle.missing} == {'no gauge readings'}
+    assert not done[3].cycle.missing
+
+
+def test_a_cycle_that_is_never_finished_ends_when_the_next_begins():
+    plans = session(('1a', '1b'))
+    feedback, blocks = run(plans)
+    cut = plans[1].stamp + 1_700_000_000
+    keep = [f for f in feedback if not cut <= f.stamp < plans[2].stamp]
+    done = estimate(plans, keep, blocks)
+    assert [d.cycle.plan.cycle for d in done] == ['1a-nest', '1a-static', '1b-nest', '1b-static']
+    assert [p.index for p in done[1].cycle.points] == [0, 1, 2]
+    assert {m.index for m in done[1].cycle.missing} == {3, 4, 5}
+    assert not done[3].cycle.missing
+
+
+def test_without_a_calibration_every_pose_is_missing_for_that_reason():
+    plan = static_plan(T0)
+    done = estimate([plan], *run([plan]))
+    assert not done[0].cycle.points
+    assert {m.reason for m in done[0].cycle.missing} == {'no nest calibration of set-up 1a'}
+
+
+def test_a_failed_calibration_is_said():
+    plans = session()
+    feedback, blocks = run(plans)
+    dead = [replace(b, displacement=b.displacement * [1, 1, 0] + 1e-6) for b in blocks]
+    done = estimate(plans, feedback, dead)
+    assert done[0].nest is None and 'gauge 3' in done[0].problem
+    assert not done[1].cycle.points
+
+
+def test_frozen_feedback_is_stale_not_settled():
+    plans = session()
+    feedback, blocks = run(plans)
+    frozen = plans[1].stamp + 400_000_000
+    still = next(f for f in feedback if f.stamp >= frozen)
+    stopped = [
+        replace(f, stamp=still.stamp, position=still.position)
+        if frozen <= f.stamp < frozen + 1_500_000_000 else f
+        for f in feedback
+    ]
+    cycle = estimate(plans, stopped, blocks)[1].cycle
+    assert 1 in {m.index for m in cycle.missing}
+    assert all('stale' in m.reason for m in cycle.missing)
+
+
+def test_memory_stays_bounded_without_a_plan():
+    estimator = Estimator()
+    feedback, blocks = run([replace(nest_plan(), dwell=5.0)])
+    assert feedback[-1].stamp - feedback[0].stamp > 100e9
+    for sample in feedback:
+        estimator.add_feedback(sample)
+    for block in blocks:
+        estimator.add_gauges(block)
+    assert len(estimator._feedback) < 25 * 50
+    assert len(estimator._gauges.blocks) < 25 * 5
+
+
+def test_dynamic_cycles_are_named_as_not_evaluated():
+    plan = replace(static_plan(T0), kind=Kind.DYNAMIC, dwell=0.0)
+    done = estimate([plan], *run([replace(plan, dwell=0.3)]))
+    assert 'not evaluated' in done[0].problem
