@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
+
 import numpy as np
 
 from rtest_estimation.records import CyclePlan, Feedback, GaugeBlock
@@ -58,7 +60,7 @@ class FeedbackBuffer:
 
     def forget(self, before: int) -> None:
         """Drop what is older than `before` [ns]."""
-        keep = int(np.searchsorted(np.array(self.stamps, dtype=np.int64), before))
+        keep = bisect_left(self.stamps, before)
         del self.stamps[:keep], self.samples[:keep]
 
 

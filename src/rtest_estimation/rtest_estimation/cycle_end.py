@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
+
 import numpy as np
 
 from rtest_estimation.buffers import FeedbackBuffer
@@ -24,13 +26,16 @@ class CycleEnd:
         self._seen = 0
         self._since: int | None = None
         self._tried: int | None = None
+        self._end: int | None = None
 
     def find(self, plan: CyclePlan, feedback: FeedbackBuffer, limit: int | None) -> int | None:
         """End of the cycle [ns], or None while it is going on. Looks at new samples only."""
+        if self._end is not None:
+            return self._end
         rotary = [axis in ROTARY_LETTERS for axis in plan.axes]
         near = [self.rules.near[turns] for turns in rotary]
         last = plan.commands[-1]
-        start = max(self._seen, int(np.searchsorted(feedback.stamps, plan.stamp)))
+        start = max(self._seen, bisect_left(feedback.stamps, plan.stamp))
         for number in range(start, len(feedback)):
             sample = feedback.samples[number]
             if limit is not None and sample.stamp >= limit:
@@ -49,6 +54,7 @@ class CycleEnd:
                 reached = {d.index for d in dwells}
                 done = len(plan.commands) - 1 in reached
                 if done and (plan.kind is not Kind.DYNAMIC) and (len(reached) > 1 or not missing):
+                    self._end = end
                     return end
         return None
 

@@ -10,6 +10,8 @@ from rtest_estimation.records import CyclePlan, Missing
 
 # ISO 841 letters of rotary axes, and S, the spindle angle of a plan. Only tolerances depend on it.
 ROTARY_LETTERS = frozenset('ABCS')
+# Six standard deviations of normal noise, in median absolute deviations.
+_ENDS = 6 * 1.4826
 
 
 @dataclass(frozen=True)
@@ -58,8 +60,8 @@ def find_dwells(
 ) -> tuple[list[Dwell], list[Missing]]:
     """Match the stretches in which every axis stood still to the poses of the plan, in order.
 
-    A stretch is used for at most the planned dwell time, so that the result does not depend on how
-    long the machine waits at its last pose.
+    Of a stop that is longer than planned the last part is used, the most settled one; of the last
+    stop the first part, so that the result does not depend on how long the machine waits there.
 
     Parameters
     ----------
@@ -93,7 +95,11 @@ def find_dwells(
             continue
         number, place = matched[row]
         first, last = runs[number]
-        arrived = int(stamps[first]) + place * planned
+        rows = [r for r, (n, _) in matched.items() if n == number]
+        arrived = int(stamps[first])
+        if count - 1 not in rows:
+            arrived = max(arrived, int(stamps[last]) - len(rows) * planned)
+        arrived += place * planned
         start = arrived + int(rules.settle * 1e9)
         end = min(int(stamps[last]), arrived + planned)
         if end - arrived < planned // 2 or end <= start:
@@ -131,10 +137,11 @@ def _standing(
     runs: list[tuple[int, int]] = []
     for begin, end in zip(edges[::2], edges[1::2], strict=True):
         first, last = int(begin), int(end) - 1 + lag
-        # A slow approach is quiet over a short span but not where it ends up.
-        rest = np.median(positions[first : last + 1], axis=0)
-        off = (np.abs(positions[first : last + 1] - rest) > still).any(axis=1)
-        settled = np.flatnonzero(~off)
+        # The tails of a move are quiet over a short span but not where the axes come to rest:
+        # the ends of a stop are held to the scatter of the encoders in it.
+        off = positions[first : last + 1] - np.median(positions[first : last + 1], axis=0)
+        scatter = _ENDS * np.median(np.abs(off), axis=0)
+        settled = np.flatnonzero((np.abs(off) <= np.clip(scatter, still / 50, still)).all(axis=1))
         if len(settled) >= 2:
             runs.append((first + int(settled[0]), first + int(settled[-1])))
     return runs

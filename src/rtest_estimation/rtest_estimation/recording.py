@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -88,9 +89,7 @@ def recording_of(bag: Bag, topics: Mapping[str, str] | None = None) -> Recording
         if chosen[role] is None:
             message_type, topic = ROLES[role]
             why = bag.warnings[0] if bag.warnings else 'record the session with this topic'
-            raise UserError(
-                f'{bag.path}: no {name} (topic /{topic}, type {message_type}); {why}'
-            )
+            raise UserError(f'{bag.path}: no {name} (topic /{topic}, type {message_type}); {why}')
     arrived = _convert(bag, chosen['gauges'], messages.gauge_block, warnings)
     lost = _check_sequence(arrived, chosen['gauges'], bag.start, warnings)
     gauges = _in_order(arrived, chosen['gauges'], bag.start, warnings)
@@ -234,8 +233,7 @@ def _in_order(
     records: list[Stamped], topic: str, start: int, warnings: list[str]
 ) -> tuple[Stamped, ...]:
     """Sort by stamp; stamps that step back are named in a warning."""
-    pairs = zip(records, records[1:], strict=False)
-    back = [record for before, record in pairs if record.stamp < before.stamp]
+    back = [record for before, record in pairwise(records) if record.stamp < before.stamp]
     if not back:
         return tuple(records)
     warnings.append(

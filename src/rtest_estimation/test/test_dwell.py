@@ -88,6 +88,17 @@ def test_equal_poses_in_a_row_share_a_stop():
     assert trailing(plan([*commands, commands[-1]])) == 2
 
 
+def test_of_a_long_stop_the_last_part_is_used_but_at_the_end_the_first():
+    stamps, positions = feedback(ROUND, dwell=2.0, wait=5.0)
+    dwells, missing = find_dwells(plan(ROUND, 0.3), stamps, positions)
+    assert not missing
+    for number, dwell in enumerate(dwells[:-1]):
+        leaves = T0 + number * 2_300_000_000 + 2_000_000_000
+        assert leaves - 300_000_000 <= dwell.start < dwell.end <= leaves
+    arrival = T0 + 4 * 2_300_000_000
+    assert arrival <= dwells[-1].start < dwells[-1].end <= arrival + 320_000_000
+
+
 def test_a_short_stop_is_not_settled():
     stamps, positions = feedback(ROUND, dwell=0.1)
     _, missing = find_dwells(plan(ROUND), stamps, positions)

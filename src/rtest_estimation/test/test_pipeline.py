@@ -82,6 +82,25 @@ def test_waiting_at_the_last_pose_changes_no_bit():
     ]
 
 
+def test_readings_that_lag_behind_the_feedback_end_the_cycle_all_the_same():
+    plans = session()
+    feedback, blocks = run(plans)
+    estimator, ready = Estimator(), []
+    items = [(f.stamp, estimator.add_feedback, f) for f in feedback]
+    # Half a second late, as a batch on its way is.
+    items += [(b.stamp + 500_000_000, estimator.add_gauges, b) for b in blocks]
+    for plan in plans:
+        estimator.add_plan(plan)
+    for _, add, record in sorted(items, key=lambda i: i[0]):
+        add(record)
+        one = estimator.finished()
+        if one is not None:
+            ready.append((one.cycle.plan.cycle, record.stamp))
+    assert [name for name, _ in ready] == ['1a-nest', '1a-static']
+    # The nest calibration was ready before the next plan began.
+    assert ready[0][1] < plans[1].stamp
+
+
 def test_four_gauges_and_one_that_fails():
     plans = session()
     feedback, blocks = run(plans, channels=4)

@@ -15,8 +15,8 @@ from rosbags.rosbag2 import Writer as RosbagsWriter
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from rtest_estimation.errors import UserError
-from rtest_estimation.records import Kind
 from rtest_estimation.recording import read_recording
+from rtest_estimation.records import Kind
 
 ROOT = Path(__file__).resolve().parents[3]
 SHARED = ROOT.parent / 'shared' / 'sessions'
