@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import heapq
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -46,14 +46,16 @@ def identify_recording(
     path: Path | str,
     machine_path: Path | str | None = None,
     progress: Callable[[str], None] = lambda line: None,
+    topics: Mapping[str, str] | None = None,
 ) -> Identification:
     """Identify the machine from a recording alone.
 
-    machine_path : another machine file than the recorded one.
+    machine_path : another machine file than the recorded one
+    topics : role to topic name, as in `rtest_estimation.recording.read_recording`
 
     Raises UserError naming file and what is expected.
     """
-    recording = read_recording(path)
+    recording = read_recording(path, topics)
     if machine_path is not None:
         machine = load_machine(machine_path)
     elif recording.machine_text is not None:

@@ -20,6 +20,7 @@ from rtest_estimation.nodes.qos import LATCHED, LATCHED_100, STREAM
 from rtest_estimation.nodes.run import run
 from rtest_estimation.pipeline import EstimationRules, Estimator, Finished
 from rtest_estimation.records import GaugeBlock, Status
+from rtest_estimation.sequence import SequenceCheck
 
 
 class EstimatorNode(Node):
@@ -35,6 +36,7 @@ class EstimatorNode(Node):
         self._estimator = Estimator(rules)
         self._centre_due = 0
         self._damaged: list[str] = []
+        self._sequence = SequenceCheck()
         self._last: Finished | None = None
 
         self._nest = self.create_publisher(NestCalibration, 'rtest/nest', LATCHED)
@@ -71,6 +73,7 @@ class EstimatorNode(Node):
 
     def _add_gauges(self, block: GaugeBlock) -> None:
         self._estimator.add_gauges(block)
+        self._sequence.add(block.stamp, block.sequence, len(block.displacement))
         calibration = self._estimator.nest
         if calibration is None or block.displacement.shape[1] != len(calibration.direction):
             return
@@ -113,13 +116,19 @@ class EstimatorNode(Node):
 
     def _report(self) -> None:
         progress = self._estimator.progress()
-        values = {'discarded_feedback': self._estimator.discarded, 'damaged': len(self._damaged)}
+        values = {
+            'discarded_feedback': self._estimator.discarded,
+            'damaged': len(self._damaged),
+            'lost_readings': self._sequence.lost,
+        }
         line = 'waiting for a plan'
         if progress is not None:
             plan, done = progress
             values |= {'cycle': plan.cycle, 'poses_done': done, 'poses': len(plan.commands)}
             line = f'{plan.cycle}: {done} of {len(plan.commands)} poses'
         level = diagnostics.OK
+        if self._sequence.lost:
+            level, line = diagnostics.WARN, f'{self._sequence.lost} gauge readings did not arrive'
         if self._damaged:
             level, line = diagnostics.WARN, f'damaged message: {self._damaged[-1]}'
         self._diagnostics.publish(diagnostics.status('estimator: cycle', level, line, values))

@@ -1,0 +1,1 @@
+"""Everything that touches the world: gauges, CNC, recorder, replay, simulated cell."""

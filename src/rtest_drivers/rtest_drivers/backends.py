@@ -1,0 +1,61 @@
+"""Where readings and feedback come from: the backends of the gauge and the CNC driver.
+
+A backend stamps at the read, in the clock of its device. It counts what the device has acquired in
+`GaugeBlock.sequence`, so that a jump is a loss; the driver makes that start at zero.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Protocol, TypeVar
+
+from rtest_drivers.cell_link import CNC, GAUGES, CellCnc, CellGauges
+from rtest_estimation.errors import UserError
+from rtest_estimation.records import Feedback, GaugeBlock
+
+__all__ = ['CNC', 'CNC_BACKENDS', 'GAUGES', 'GAUGE_BACKENDS', 'CncBackend', 'GaugeBackend']
+
+
+class GaugeBackend(Protocol):
+    """A nest of gauges."""
+
+    def open(self) -> None:
+        """Connect; raises ConnectionError saying what failed and what to do."""
+
+    def read(self, timeout: float) -> list[GaugeBlock]:
+        """What was acquired since the last call, waiting up to `timeout` [s] for the first.
+
+        Empty where nothing came in that time. Raises ConnectionError when the device is lost.
+        """
+
+    def close(self) -> None:
+        """Disconnect; does nothing where it is not open."""
+
+
+class CncBackend(Protocol):
+    """A CNC's encoder feedback; the same calls as `GaugeBackend`."""
+
+    def open(self) -> None:
+        """Connect; raises ConnectionError saying what failed and what to do."""
+
+    def read(self, timeout: float) -> list[Feedback]:
+        """What came since the last call, waiting up to `timeout` [s] for the first."""
+
+    def close(self) -> None:
+        """Disconnect; does nothing where it is not open."""
+
+
+# Name of the parameter `backend` to what makes one from the parameter `address`.
+GAUGE_BACKENDS: dict[str, Callable[[str], GaugeBackend]] = {'cell': CellGauges}
+CNC_BACKENDS: dict[str, Callable[[str], CncBackend]] = {'cell': CellCnc}
+
+_Backend = TypeVar('_Backend')
+
+
+def make(known: dict[str, Callable[[str], _Backend]], name: str, address: str) -> _Backend:
+    """A backend by name; raises UserError where there is none or the address is missing."""
+    if name not in known:
+        raise UserError(f'parameter backend: expected one of {sorted(known)}, got {name!r}')
+    if not address:
+        raise UserError(f'parameter address: missing, backend {name!r} needs it')
+    return known[name](address)

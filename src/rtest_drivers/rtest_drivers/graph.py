@@ -1,0 +1,177 @@
+"""The nodes of a session and their parameters: one table for `rtest` and for `ros2 launch`."""
+
+from __future__ import annotations
+
+import json
+import re
+import tempfile
+import time
+import uuid
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from rtest_estimation.errors import UserError
+
+ParameterValue = str | int | float | bool
+
+# What ends the session when it ends, and what must see everybody else's last message.
+LEADER = 'session'
+LAST = 'recorder'
+LOGS = 'log'
+# The problems are small: more threads than one are slower, and not bit for bit repeatable.
+ONE_THREAD = {'OMP_NUM_THREADS': '1', 'OPENBLAS_NUM_THREADS': '1'}
+
+_NAME = re.compile(r'[A-Za-z0-9][A-Za-z0-9._-]*')
+_NAMESPACE = re.compile(r'/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*')
+_REMAP = re.compile(r'[^\s:=]+:=[^\s:=]+')
+
+
+@dataclass(frozen=True)
+class GraphNode:
+    """One node of the graph; its executable has the name of the node.
+
+    lifecycle : whether the session node configures and activates it
+    """
+
+    name: str
+    package: str
+    parameters: dict[str, ParameterValue] = field(default_factory=dict)
+    lifecycle: bool = False
+
+    @property
+    def module(self) -> str:
+        """Module whose `main` is the node."""
+        return f'{self.package}.nodes.{self.name}'
+
+
+@dataclass(frozen=True)
+class GraphSettings:
+    """What a user chooses when starting a session.
+
+    config : session file (YAML)
+    session : name of the session, of its folder and of its recording
+    sphere_radius : of the session file [m]
+    out : the recording is written to out/session/session.mcap
+    simulate : truth file of the simulated cell; None where real drivers are already in the graph
+    rate : simulated seconds per second of wall time; 0 is as fast as the cell can
+    namespace : of every node and topic, empty for none
+    remaps : rules ``from:=to`` for every node
+    address : where the simulated cell is to be reached by its drivers (AF_UNIX)
+    """
+
+    config: Path
+    session: str
+    out: Path
+    simulate: Path | None = None
+    sphere_radius: float = 0.0127
+    rate: float = 0.0
+    namespace: str = ''
+    remaps: tuple[str, ...] = ()
+    address: str = field(default_factory=lambda: cell_address())
+
+    def __post_init__(self) -> None:
+        """Refuse names that would become a wrong path or a wrong ROS argument (UserError)."""
+        if not _NAME.fullmatch(self.session) or self.session == LOGS:
+            raise UserError(
+                f'session name {self.session!r}: expected letters, digits, dot, dash, underscore'
+                f'; {LOGS!r} is taken'
+            )
+        if self.namespace and not _NAMESPACE.fullmatch(self.namespace):
+            raise UserError(
+                f'namespace {self.namespace!r}: expected a ROS name such as cell_1 or /hall/cell_1'
+            )
+        for rule in self.remaps:
+            if not _REMAP.fullmatch(rule):
+                raise UserError(f'remap {rule!r}: expected FROM:=TO')
+        if not 0.0 <= self.rate < float('inf'):
+            raise UserError(f'rate {self.rate}: expected a number of 0 (no limit) or more')
+
+    @property
+    def folder(self) -> Path:
+        """The recording's folder, which the recorder makes, and where results are written."""
+        return self.out / self.session
+
+    @property
+    def log(self) -> Path:
+        """What the nodes say; not in the folder of the recording, which is to be a bag only."""
+        return self.out / LOGS / self.session
+
+    @property
+    def recording(self) -> Path:
+        """The recording, one MCAP file."""
+        return self.folder / f'{self.session}.mcap'
+
+
+def session_name(stem: str) -> str:
+    """A name that no earlier session has: stem, date, time."""
+    return f'{stem}-{time.strftime("%Y%m%d-%H%M%S")}'
+
+
+def cell_address() -> str:
+    """A socket path of its own for one simulated cell; short, as AF_UNIX wants it."""
+    return str(Path(tempfile.gettempdir()) / f'rtest-cell-{uuid.uuid4().hex[:12]}.sock')
+
+
+def session_nodes(settings: GraphSettings) -> tuple[GraphNode, ...]:
+    """The nodes of a session, in the order in which they are started.
+
+    Without a simulated cell the drivers are expected in the graph already: the session node
+    waits for them and says which one is missing.
+    """
+    simulated = settings.simulate is not None
+    clock: dict[str, ParameterValue] = {'use_sim_time': simulated}
+    driver: dict[str, ParameterValue] = {'backend': 'cell', 'address': settings.address, **clock}
+    nodes = [
+        GraphNode(
+            LAST,
+            'rtest_drivers',
+            {'out': str(settings.out), 'session': settings.session, **clock},
+        ),
+        GraphNode(
+            'estimator',
+            'rtest_estimation',
+            {'sphere_radius_mm': settings.sphere_radius * 1e3, **clock},
+        ),
+        GraphNode('identifier', 'rtest_identification', clock),
+    ]
+    if simulated:
+        nodes += [
+            GraphNode(
+                'cell',
+                'rtest_drivers',
+                {
+                    'truth': str(settings.simulate),
+                    'address': settings.address,
+                    'rate': float(settings.rate),
+                    'epoch': 0,
+                },
+            ),
+            GraphNode('gauges', 'rtest_drivers', driver, lifecycle=True),
+            GraphNode('cnc', 'rtest_drivers', driver, lifecycle=True),
+        ]
+    nodes.append(
+        GraphNode(
+            LEADER,
+            'rtest_drivers',
+            {
+                'config': str(settings.config),
+                'session': settings.session,
+                'simulated': simulated,
+                **clock,
+            },
+        )
+    )
+    return tuple(nodes)
+
+
+def ros_arguments(node: GraphNode, namespace: str = '', remaps: tuple[str, ...] = ()) -> list[str]:
+    """Command-line arguments after `--ros-args` that `ros2 launch` would pass to the node."""
+    arguments = ['-r', f'__node:={node.name}']
+    if namespace:
+        arguments += ['-r', '__ns:=/' + namespace.lstrip('/')]
+    for rule in remaps:
+        arguments += ['-r', rule]
+    for name, value in node.parameters.items():
+        # The value is read as YAML, of which JSON is a part: a session named 12 stays a string.
+        arguments += ['-p', f'{name}:={json.dumps(value)}']
+    return arguments

@@ -1,0 +1,82 @@
+"""What `rtest info` says about a recording."""
+
+from __future__ import annotations
+
+from datetime import datetime, timezone
+from pathlib import Path
+
+import yaml
+
+from rtest_estimation.bagfile import Bag, read_bag
+from rtest_estimation.errors import UserError
+from rtest_estimation.recording import TYPES, Recording, recording_of
+from rtest_estimation.records import CyclePlan
+
+
+def describe(path: str | Path) -> list[str]:
+    """Lines that describe a recording: topics, session, plans, losses, warnings.
+
+    Works for any bag; one that cannot be identified from is described with the reason.
+
+    Raises UserError where there is no recording at `path`.
+    """
+    bag = read_bag(path, TYPES)
+    lines = _file_lines(bag)
+    try:
+        recording = recording_of(bag)
+    except UserError as error:
+        warnings: tuple[str, ...] = (*bag.warnings, f'not a complete session: {error}')
+    else:
+        lines += _session_lines(recording)
+        warnings = recording.warnings
+    return lines + _topic_lines(bag) + [f'warning   {warning}' for warning in warnings]
+
+
+def _file_lines(bag: Bag) -> list[str]:
+    lines = [f'recording {bag.path}', f'size      {bag.size / 1e6:.1f} MB']
+    if bag.start:
+        start = datetime.fromtimestamp(bag.start / 1e9, tz=timezone.utc)
+        lines += [
+            f'start     {start:%Y-%m-%d %H:%M:%S} UTC',
+            f'duration  {(bag.end - bag.start) / 1e9:.1f} s',
+        ]
+    return [*lines, f'closed    {"yes" if bag.closed else "no"}']
+
+
+def _session_lines(recording: Recording) -> list[str]:
+    return [
+        f'session   {recording.session}',
+        f'machine   {_machine_name(recording.machine_text)}',
+        f'lost      {recording.lost} readings',
+        *(f'plan      {_plan(plan)}' for plan in recording.plans),
+    ]
+
+
+def _machine_name(text: str | None) -> str:
+    if text is None:
+        return 'not recorded'
+    try:
+        return str(yaml.safe_load(text)['name'])
+    except (yaml.YAMLError, KeyError, TypeError):
+        return 'recorded, without a name'
+
+
+def _plan(plan: CyclePlan) -> str:
+    kind = plan.kind.name.lower().replace('_', ' ')
+    sphere = ', '.join(f'{1e3 * value:g}' for value in plan.sphere)
+    return (
+        f'{plan.cycle}: {kind}, {len(plan.commands)} poses of {" ".join(plan.axes)}, '
+        f'sphere at ({sphere}) mm'
+    )
+
+
+def _topic_lines(bag: Bag) -> list[str]:
+    """One line a topic; the rate is over the whole recording."""
+    duration = (bag.end - bag.start) / 1e9
+    width = max((len(name) for name in bag.topics), default=0)
+    type_width = max((len(kind) for kind, _ in bag.topics.values()), default=0)
+    return [
+        f'topic     {name:{width}}  {kind:{type_width}}  {count:8d} messages'
+        + (f'  {count / duration:8.2f} Hz' if duration > 0 and count > 1 else '')
+        for name, (kind, count) in sorted(bag.topics.items())
+    ]

@@ -1,0 +1,347 @@
+"""Node `session`: wakes the drivers, starts one cycle after the other, closes the recording.
+
+Parameters
+----------
+config : session file (YAML)
+session : name of the session
+simulated : whether the time comes from a simulated cell
+ready_timeout : how long the other nodes may take to appear [s]
+cycle_timeout : how long a cycle may take [s]; 0 is an estimate from its path
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from lifecycle_msgs.msg import State, Transition
+from lifecycle_msgs.srv import ChangeState, GetState
+from rclpy.client import Client
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.node import Node
+from rtest_msgs.msg import Cycle, NestCalibration
+from rtest_msgs.msg import CyclePlan as CyclePlanMessage
+from std_msgs.msg import String
+from std_srvs.srv import Trigger
+
+from rtest_drivers.schedule import NANOSECONDS, path_duration, pose_count
+from rtest_estimation.errors import UserError
+from rtest_estimation.nodes import diagnostics, publish
+from rtest_estimation.nodes.qos import LATCHED, LATCHED_100
+from rtest_estimation.records import CyclePlan, Kind
+from rtest_identification.plans import SessionConfig, load_session
+
+DRIVERS = ('gauges', 'cnc')
+# Who must not miss the first reading.
+LISTENERS = ('recorder', 'estimator')
+STREAMS = ('rtest/gauges', 'rtest/cnc/feedback')
+# Closed in this order: what the earlier one publishes last, the later one still needs.
+FINISHERS = ('estimator', 'identifier', 'recorder')
+# Wall time a service may take [s]: an identification of a long session is the longest.
+SERVICE_TIMEOUT_S = 120.0
+# A subscription is seen in the graph a little before its publisher has matched it [s].
+SETTLE_S = 0.5
+PROGRESS_S = 2.0
+# Warnings of these nodes are told at the end, or are our own.
+QUIET = ('identifier', 'session')
+# A simulated clock that stands still this long has lost its cell [s].
+CLOCK_TIMEOUT_S = 30.0
+
+
+class SessionError(RuntimeError):
+    """The session cannot go on; says what did not happen."""
+
+
+class SessionNode(Node):
+    """Runs a session from waiting for the other nodes to the closed recording.
+
+    All waiting is done by spinning in `wait`, so that the steps of a session read from top to
+    bottom; time-outs are wall time, except those of the machine's motion.
+    """
+
+    def __init__(self) -> None:
+        super().__init__('session')
+        self.session = self.declare_parameter('session', 'session').value
+        self.simulated = self.declare_parameter('simulated', False).value
+        self.ready_timeout = self.declare_parameter('ready_timeout', 30.0).value
+        self.cycle_timeout = self.declare_parameter('cycle_timeout', 0.0).value
+        self.config: SessionConfig = load_session(self.declare_parameter('config', '').value)
+
+        self._machine = self.create_publisher(String, 'rtest/machine', LATCHED)
+        self._plans = self.create_publisher(CyclePlanMessage, 'rtest/plan', LATCHED_100)
+        self._diagnostics = diagnostics.Diagnostics(self)
+        self.create_subscription(Cycle, 'rtest/cycle', self._on_cycle, LATCHED_100)
+        self.create_subscription(NestCalibration, 'rtest/nest', self._on_nest, LATCHED)
+        self.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, 100)
+        self._change = {
+            name: self.create_client(ChangeState, f'{name}/change_state') for name in DRIVERS
+        }
+        self._state = {name: self.create_client(GetState, f'{name}/get_state') for name in DRIVERS}
+        self._finish = {name: self.create_client(Trigger, f'{name}/finish') for name in FINISHERS}
+
+        self._spinner = SingleThreadedExecutor()
+        self._spinner.add_node(self)
+        self._started = self._reported = time.monotonic()
+        self._cycles: dict[tuple[str, int], Cycle] = {}
+        self._nests: dict[str, NestCalibration] = {}
+        self._poses_done: tuple[str, int, int] | None = None
+        self._finished: tuple[str, dict[str, str]] = ('', {})
+        self._complaints: set[str] = set()
+        self._problems: list[str] = []
+        self._status = 'waiting for the other nodes'
+        self._cycle_number = 0
+
+    # ---- the session, step by step ----
+
+    def run(self) -> list[str]:
+        """Run the session; returns what went wrong on the way, nothing when all went through.
+
+        Raises SessionError where it cannot go on.
+        """
+        self._wait_for_nodes()
+        self._machine.publish(String(data=self.config.machine.text))
+        for name in DRIVERS:
+            self._bring_to(name, State.PRIMARY_STATE_INACTIVE)
+        self._wait_for_listeners()
+        for name in DRIVERS:
+            self._bring_to(name, State.PRIMARY_STATE_ACTIVE)
+        if self.simulated:
+            self._wait_for('/clock of the simulated cell', lambda: self._now() > 0)
+        poses = sum(len(plan.commands) for plan in self.config.plans)
+        self.say(f'{self.config.machine.name}: {len(self.config.plans)} cycles, {poses} poses')
+        for number, plan in enumerate(self.config.plans, 1):
+            self._cycle_number = number
+            self._measure(plan)
+        self._status = 'finishing'
+        self._close()
+        self._status = 'finished'
+        self._diagnose()
+        return self._problems
+
+    def _wait_for_nodes(self) -> None:
+        clients = {f'{name}/change_state': client for name, client in self._change.items()}
+        clients |= {f'{name}/finish': client for name, client in self._finish.items()}
+
+        def missing() -> list[str]:
+            return [name for name, client in clients.items() if not client.service_is_ready()]
+
+        if not self.wait(lambda: not missing(), self.ready_timeout):
+            names = dict.fromkeys(service.split('/')[0] for service in missing())
+            raise SessionError(
+                f'after {self.ready_timeout:.0f} s these nodes are not in the graph: '
+                f'{", ".join(names)} (their services {", ".join(missing())} are missing); start '
+                'them in the same ROS domain and namespace'
+            )
+
+    def _wait_for_listeners(self) -> None:
+        self._status = 'waiting for subscriptions'
+
+        def missing() -> list[str]:
+            gaps = []
+            for topic in STREAMS:
+                resolved = self.resolve_topic_name(topic)
+                present = {i.node_name for i in self.get_subscriptions_info_by_topic(resolved)}
+                gaps += [f'{name} to {resolved}' for name in LISTENERS if name not in present]
+            return gaps
+
+        if not self.wait(lambda: not missing(), self.ready_timeout):
+            raise SessionError(
+                f'after {self.ready_timeout:.0f} s these subscriptions are missing: '
+                f'{", ".join(missing())}; check remappings'
+            )
+        self.wait(lambda: False, SETTLE_S)
+
+    def _bring_to(self, driver: str, goal: int) -> None:
+        """Take a driver from whatever state it is in to inactive or active."""
+        steps = {
+            State.PRIMARY_STATE_UNCONFIGURED: (Transition.TRANSITION_CONFIGURE, 'configured'),
+            State.PRIMARY_STATE_INACTIVE: (Transition.TRANSITION_ACTIVATE, 'activated'),
+        }
+        self._status = f'preparing {driver}'
+        while True:
+            answer = self._call(self._state[driver], GetState.Request(), f'{driver}/get_state')
+            state = answer.current_state.id
+            # Somebody else may have activated the driver already; that is as good.
+            if state == goal or state == State.PRIMARY_STATE_ACTIVE:
+                return
+            if state not in steps:
+                raise SessionError(f'driver {driver} is {answer.current_state.label}; restart it')
+            transition, word = steps[state]
+            if not self._transition(driver, transition):
+                raise SessionError(f'driver {driver} could not be {word}; its log says why')
+
+    def _transition(self, driver: str, transition: int) -> bool:
+        request = ChangeState.Request(transition=Transition(id=transition))
+        return self._call(self._change[driver], request, f'{driver}/change_state').success
+
+    def _measure(self, plan: CyclePlan) -> None:
+        """Publish one plan and wait for its finished cycle."""
+        stamp = self._now()
+        key = (plan.cycle, stamp)
+        self._status = f'measuring {plan.cycle}'
+        self._poses_done = None
+        self._complaints.clear()
+        started = replace(plan, session=self.session, stamp=stamp)
+        self._plans.publish(publish.cycle_plan(started))
+        limit = self.cycle_timeout or path_duration(plan)
+        clock = (stamp, time.monotonic())
+        shown = time.monotonic()
+        while key not in self._cycles:
+            self.wait(lambda: key in self._cycles, 0.2)
+            now, wall = self._now(), time.monotonic()
+            if now != clock[0]:
+                clock = (now, wall)
+            if wall - clock[1] > CLOCK_TIMEOUT_S:
+                raise SessionError(f'{plan.cycle}: the clock has stood still for '
+                                   f'{CLOCK_TIMEOUT_S:.0f} s; is the simulated cell running?')
+            if (now - stamp) / NANOSECONDS > limit:
+                self._problem(f'{plan.cycle}: not finished after {limit:.0f} s; going on')
+                return
+            if wall - shown > PROGRESS_S and self._poses_done:
+                shown = wall
+                cycle, done, poses = self._poses_done
+                if cycle == plan.cycle and done < poses:
+                    self._say_cycle(plan, f'{done} of {poses} poses')
+        self._say_cycle(plan, self._outcome(plan, self._cycles[key]))
+
+    def _outcome(self, plan: CyclePlan, cycle: Cycle) -> str:
+        text = pose_count(len(plan.commands), len(cycle.points), len(cycle.missing))
+        if cycle.missing:
+            # The reasons are on another topic and may come a moment later.
+            self.wait(lambda: self._finished[0].startswith(f'{plan.cycle}:'), 1.0)
+            line, reasons = self._finished
+            if line.startswith(f'{plan.cycle}:') and reasons:
+                pose, reason = next(iter(reasons.items()))
+                text += f' ({pose}: {reason})'
+        if plan.kind is Kind.NEST_CALIBRATION:
+            # The calibration is on another topic and may come a moment later.
+            self.wait(lambda: cycle.calibration in self._nests, 1.0 if cycle.calibration else 0.0)
+            nest = self._nests.get(cycle.calibration)
+            if nest is None:
+                self._problems.append(f'{plan.cycle}: no calibration')
+                return f'{text}, no calibration'
+            text += f', residual {nest.residual * 1e6:.2f} µm'
+        return text
+
+    def _close(self) -> None:
+        for name in DRIVERS:
+            if not self._transition(name, Transition.TRANSITION_DEACTIVATE):
+                self._problem(f'driver {name} could not be deactivated')
+        for name in FINISHERS:
+            # Let the last messages of the one before arrive.
+            self.wait(lambda: False, SETTLE_S)
+            answer = self._call(self._finish[name], Trigger.Request(), f'{name}/finish')
+            self.say(f'{name}: {answer.message}')
+            if not answer.success:
+                self._problems.append(f'{name}: {answer.message}')
+
+    # ---- waiting, saying ----
+
+    def wait(self, done: Callable[[], bool], timeout: float) -> bool:
+        """Spin until `done()` or `timeout` seconds of wall time; returns whether it is done."""
+        deadline = time.monotonic() + timeout
+        while not done():
+            left = deadline - time.monotonic()
+            if left <= 0.0:
+                return False
+            self._spinner.spin_once(timeout_sec=min(left, 0.1))
+            if time.monotonic() - self._reported >= 1.0:
+                self._reported = time.monotonic()
+                self._diagnose()
+        return True
+
+    def _wait_for(self, what: str, done: Callable[[], bool]) -> None:
+        if not self.wait(done, self.ready_timeout):
+            raise SessionError(f'after {self.ready_timeout:.0f} s there is no {what}')
+
+    def _call(self, client: Client, request: Any, what: str) -> Any:
+        future = client.call_async(request)
+        if not self.wait(future.done, SERVICE_TIMEOUT_S):
+            raise SessionError(f'{what} did not answer within {SERVICE_TIMEOUT_S:.0f} s')
+        return future.result()
+
+    def _now(self) -> int:
+        return self.get_clock().now().nanoseconds
+
+    def say(self, text: str) -> None:
+        """One line of progress for the person who waits."""
+        print(f'[{time.monotonic() - self._started:3.0f} s] {text}', flush=True)
+
+    def _say_cycle(self, plan: CyclePlan, text: str) -> None:
+        self.say(f'{self._cycle_number}/{len(self.config.plans)} {plan.cycle}: {text}')
+
+    def _problem(self, text: str) -> None:
+        self._problems.append(text)
+        self.get_logger().warning(text)
+        self.say(text)
+        self._diagnose()
+
+    # ---- messages ----
+
+    def _on_cycle(self, message: Cycle) -> None:
+        if message.plan.session == self.session:
+            stamp = message.plan.header.stamp
+            key = (message.plan.cycle, stamp.sec * NANOSECONDS + stamp.nanosec)
+            self._cycles[key] = message
+
+    def _on_nest(self, message: NestCalibration) -> None:
+        self._nests[message.calibration] = message
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            values = {pair.key: pair.value for pair in status.values}
+            if status.name == 'estimator: cycle':
+                if {'cycle', 'poses_done', 'poses'} <= values.keys():
+                    done, poses = int(values['poses_done']), int(values['poses'])
+                    self._poses_done = (values['cycle'], done, poses)
+            elif status.name == 'estimator: finished cycle':
+                self._finished = (status.message, values)
+                continue
+            # Once per cycle: a message may carry numbers that change every second.
+            source = status.name.strip('/').split(':')[0]
+            worse = status.level in (diagnostics.WARN, diagnostics.ERROR)
+            if worse and source not in self._complaints and source not in QUIET:
+                self._complaints.add(source)
+                self.say(f'{source}: {status.message}')
+
+    def _diagnose(self) -> None:
+        level = diagnostics.WARN if self._problems else diagnostics.OK
+        text = self._problems[-1] if self._problems else self._status
+        values = {
+            'session': self.session,
+            'state': self._status,
+            'cycle': self._cycle_number,
+            'cycles': len(self.config.plans),
+            'problems': len(self._problems),
+        }
+        self._diagnostics.publish(diagnostics.status('session: progress', level, text, values))
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the node; 0 when all went through, 1 when something failed, 2 for a user's mistake."""
+    rclpy.init(args=args)
+    try:
+        problems = SessionNode().run()
+    except UserError as error:
+        print(f'session: {error}', file=sys.stderr)
+        return 2
+    except SessionError as error:
+        print(f'session: {error}', file=sys.stderr)
+        return 1
+    except (KeyboardInterrupt, ExternalShutdownException):
+        print('session: stopped before its end', file=sys.stderr)
+        return 1
+    finally:
+        rclpy.try_shutdown()
+    for problem in problems:
+        print(f'session: {problem}', file=sys.stderr)
+    return 1 if problems else 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,304 @@
+"""The simulated machine cell: carries out plans in simulated time, yields readings and feedback.
+
+Readings and feedback lie on fixed grids of simulated time and draw their noise in order; the
+random parts of a dwell or a mounting are drawn from the seed and its name. So what comes out does
+not depend on how time is chopped into steps.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from rtest_drivers.sim import gauges
+from rtest_drivers.sim.faults import Window, timed, window
+from rtest_drivers.sim.kinematics import sphere_in_table
+from rtest_drivers.sim.motion import SPINDLE, Timeline
+from rtest_drivers.sim.truth import Truth
+from rtest_estimation.errors import UserError
+from rtest_estimation.records import CyclePlan, Feedback, GaugeBlock, Kind, Status
+
+_READINGS, _OUTLIERS, _ENCODERS = 1, 2, 3
+
+
+@dataclass(frozen=True)
+class Run:
+    """A plan being or having been carried out: from start to end [ns]."""
+
+    plan: CyclePlan
+    start: int
+    end: int
+
+
+@dataclass(frozen=True)
+class Output:
+    """What the cell yielded in a step, in order of time."""
+
+    blocks: list[GaugeBlock]
+    feedback: list[Feedback]
+
+
+class Cell:
+    """A machine, a nest and encoders; `epoch` [ns] is where simulated time starts.
+
+    Plans are carried out in the order they are queued, none before its own stamp.
+    """
+
+    def __init__(self, truth: Truth, epoch: int) -> None:
+        self.truth, self.epoch, self.now = truth, epoch, epoch
+        self._timeline = Timeline(truth.machine, truth.drives, epoch)
+        self._plans: deque[CyclePlan] = deque()
+        self._run: Run | None = None
+        self._setup: str | None = None
+        self._nests: list[gauges.Nest] = []
+        self._windows: list[Window] = timed(truth.faults, epoch)
+        self._reading = 0
+        self._sequence = 0
+        self._feedback = 0
+        self._latest: Feedback | None = None
+        self._noise = np.random.default_rng([truth.seed, _READINGS])
+        self._outliers = np.random.default_rng([truth.seed, _OUTLIERS])
+        self._encoder_noise = np.random.default_rng([truth.seed, _ENCODERS])
+
+    @property
+    def axes(self) -> tuple[str, ...]:
+        """Axes of the feedback: the machine's letters and the spindle S."""
+        return self._timeline.axes
+
+    @property
+    def run(self) -> Run | None:
+        """The plan being carried out, or the last one."""
+        return self._run
+
+    @property
+    def waiting(self) -> int:
+        """Plans that have not started."""
+        return len(self._plans)
+
+    @property
+    def busy(self) -> bool:
+        """Whether a plan waits or is being carried out."""
+        return bool(self._plans) or (self._run is not None and self.now < self._run.end)
+
+    def queue(self, plan: CyclePlan) -> None:
+        """Carry out a plan when those before it are done and its stamp has come.
+
+        Raises UserError where the machine cannot do it.
+        """
+        check(plan, self.truth)
+        self._plans.append(plan)
+
+    def advance(self, until: int) -> Output:
+        """Go on to simulated time `until` [ns]; yields what was complete by then."""
+        output = Output([], [])
+        while self.now < until:
+            self._start_plans()
+            step = until
+            # A plan must start when it is due, not at the end of the step.
+            due = self._next_start()
+            if due is not None and self.now < due < until:
+                step = due
+            self.now = step
+            self._start_plans()
+            self._read_gauges(output.blocks)
+            self._read_encoders(output.feedback)
+        return output
+
+    # --- plans ---
+
+    def _next_start(self) -> int | None:
+        if not self._plans:
+            return None
+        free = self._run.end if self._run else self.epoch
+        return max(self._plans[0].stamp, free)
+
+    def _start_plans(self) -> None:
+        due = self._next_start()
+        if due is not None and due <= self.now:
+            self._start(self._plans.popleft(), self.now)
+
+    def _start(self, plan: CyclePlan, start: int) -> None:
+        skipped = {
+            fault.pose
+            for fault in self.truth.faults
+            if fault.kind == 'pose_skipped' and fault.cycle == plan.cycle
+        }
+        dwell = round(plan.dwell * 1e9)
+        columns = [self.axes.index(name) for name in plan.axes]
+        poses: dict[int, tuple[int, int]] = {}
+        clock = start
+        for pose, row in enumerate(plan.commands):
+            if pose in skipped:
+                continue
+            target = self._timeline.last.end.copy()
+            if SPINDLE not in plan.axes:
+                target[-1] = 0.0
+            target[columns] = row
+            offset = self.truth.gauges.dwell_noise * self._named(
+                f'{plan.cycle}/{pose}'
+            ).standard_normal(3)
+            if plan.setup != self._setup:
+                self._setup = plan.setup
+                leg = self._timeline.append(clock, target, -1, offset)
+                clock = max(leg.arrival, clock + round(self.truth.remount * 1e9))
+                self._mount(plan)
+                self._timeline.rest(clock, len(self._nests) - 1, offset)
+            else:
+                clock = self._timeline.append(
+                    clock, target, len(self._nests) - 1, offset
+                ).arrival
+            poses[pose] = (clock, clock + dwell)
+            clock += dwell
+        self._run = Run(plan, start, clock)
+        self._windows += [
+            window(fault, *(poses[fault.pose] if fault.pose is not None else (start, clock)))
+            for fault in self.truth.faults
+            if fault.cycle == plan.cycle and (fault.pose is None or fault.pose in poses)
+        ]
+
+    def _mount(self, plan: CyclePlan) -> None:
+        rng = self._named(f'nest/{len(self._nests)}/{plan.setup}')
+        self._nests.append(gauges.mount(self.truth.gauges, plan.sphere, rng))
+
+    def _named(self, name: str) -> np.random.Generator:
+        return np.random.default_rng([self.truth.seed, zlib.crc32(name.encode())])
+
+    # --- what is read ---
+
+    def _active(self, kind: str, times: np.ndarray) -> np.ndarray:
+        """Whether a fault of this kind is on at `times` (n,)."""
+        on = np.zeros(len(times), dtype=bool)
+        for item in self._windows:
+            if item.fault.kind == kind:
+                on |= (times >= item.start) & (times < item.end)
+        return on
+
+    def _read_gauges(self, blocks: list[GaugeBlock]) -> None:
+        data = self.truth.gauges
+        # Readings lie at epoch + 1, 2, ... periods; a block is complete with its last one.
+        complete = (self.now - self.epoch) // data.period // data.batch * data.batch
+        while self._reading < complete:
+            stop = min(complete, self._reading + 64 * data.batch)
+            times = self.epoch + (np.arange(self._reading, stop) + 1) * data.period
+            values, status = self._measure(times)
+            silent = self._active('gauge_silent', times)
+            lost = self._active('lost_block', times)
+            for first in range(0, stop - self._reading, data.batch):
+                part = slice(first, first + data.batch)
+                if silent[part].any():
+                    continue
+                if not lost[part].any():
+                    blocks.append(
+                        GaugeBlock(
+                            int(times[first]),
+                            self._sequence,
+                            data.period * 1e-9 if data.batch > 1 else 0.0,
+                            values[part],
+                            status[part],
+                        )
+                    )
+                self._sequence += data.batch
+            self._reading = stop
+
+    def _measure(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        data = self.truth.gauges
+        shape = (len(times), len(data.tilt))
+        # Drawn whatever the state, so that every reading keeps its own noise.
+        noise = data.noise * self._noise.standard_normal(shape)
+        if data.outliers:
+            hit = self._outliers.random((*shape, 2))
+            # Two uniform numbers: whether it is one, and how large (either way, up to the size).
+            noise += (hit[..., 0] < data.outliers) * data.outlier * (2.0 * hit[..., 1] - 1.0)
+        values = np.zeros(shape)
+        status = np.full(shape, Status.NO_SIGNAL, dtype=np.uint8)
+        state = self._timeline.at(times)
+        mounted = state.nest >= 0
+        if mounted.any():
+            sphere = self._sphere(state.positions[mounted]) + state.offset[mounted]
+            readings = np.empty((len(sphere), shape[1]))
+            for index in np.unique(state.nest[mounted]):
+                rows = state.nest[mounted] == index
+                readings[rows] = self._nests[index].read(sphere[rows])
+            values[mounted], status[mounted] = gauges.limit(data, readings + noise[mounted])
+        return self._spoil(times, values, status)
+
+    def _sphere(self, positions: np.ndarray) -> np.ndarray:
+        """True sphere centre in the table frame (n, 3) [m]; the run-out turns with the spindle."""
+        cosine, sine = np.cos(positions[:, -1]), np.sin(positions[:, -1])
+        x, y = self.truth.runout
+        runout = np.column_stack([x * cosine - y * sine, x * sine + y * cosine, 0.0 * sine])
+        return sphere_in_table(self.truth.machine, positions[:, :-1], self.truth.errors, runout)
+
+    def _spoil(
+        self, times: np.ndarray, values: np.ndarray, status: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        data = self.truth.gauges
+        for item in self._windows:
+            kind = item.fault.kind
+            if kind not in ('gauge_out_of_range', 'gauge_nan', 'gauge_error'):
+                continue
+            rows = np.flatnonzero((times >= item.start) & (times < item.end))
+            which = slice(None) if item.fault.gauge is None else slice(
+                item.fault.gauge, item.fault.gauge + 1
+            )
+            if kind == 'gauge_out_of_range':
+                values[rows, which], status[rows, which] = data.upper, Status.OUT_OF_RANGE
+            elif kind == 'gauge_nan':
+                values[rows, which] = np.nan
+            else:
+                values[rows, which], status[rows, which] = 0.0, Status.DEVICE_ERROR
+        return values, status
+
+    def _read_encoders(self, feedback: list[Feedback]) -> None:
+        data = self.truth.encoders
+        complete = (self.now - self.epoch) // data.period
+        if complete <= self._feedback:
+            return
+        times = self.epoch + (np.arange(self._feedback, complete) + 1) * data.period
+        machine = self.truth.machine
+        noise = [
+            data.rotary_noise if machine.axes[name].rotary else data.linear_noise
+            for name in machine.letters
+        ]
+        positions = self._timeline.at(times).positions
+        positions += self._encoder_noise.standard_normal(positions.shape) * [
+            *noise, data.rotary_noise
+        ]
+        stale = self._active('feedback_stale', times)
+        silent = self._active('feedback_silent', times)
+        for index, time in enumerate(times):
+            fresh = Feedback(int(time), self.axes, positions[index])
+            if self._latest is None or not stale[index]:
+                self._latest = fresh
+            if not silent[index]:
+                feedback.append(self._latest)
+        self._feedback = complete
+
+
+def check(plan: CyclePlan, truth: Truth) -> None:
+    """Refuse a plan the simulated machine cannot do.
+
+    Raises UserError naming cycle, axis, pose and what is expected.
+    """
+    where = f'plan {plan.cycle!r}'
+    if plan.kind is Kind.DYNAMIC:
+        raise UserError(f'{where}: the simulated cell does static cycles, not dynamic ones')
+    axes = truth.machine.axes
+    for column, name in enumerate(plan.axes):
+        if name == SPINDLE:
+            continue
+        if name not in axes:
+            raise UserError(
+                f'{where}: no axis {name} in the machine, expected {sorted(axes)} or {SPINDLE}'
+            )
+        values, slack = plan.commands[:, column], 1e-9
+        axis = axes[name]
+        outside = np.flatnonzero((values < axis.lower - slack) | (values > axis.upper + slack))
+        if outside.size:
+            raise UserError(
+                f'{where}: pose {outside[0]}: {name} = {values[outside[0]]:.6g} is outside '
+                f'{axis.lower:.6g} to {axis.upper:.6g} (m or rad)'
+            )

@@ -1,0 +1,75 @@
+"""The simulated sensors nest: contact gauges, their mounting, noise and range."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rtest_estimation.records import Status
+
+
+@dataclass(frozen=True)
+class GaugeData:
+    """What the gauges are.
+
+    azimuth, tilt : (gauges,) [rad]; a gauge under the sphere points to it from `azimuth` about the
+        table's Z and `tilt` below the horizontal
+    direction_error : standard deviation of each direction after a mounting [rad]
+    position_error : standard deviation of the nest's zero against the sphere [m]
+    noise : white, of a single reading [m]
+    dwell_noise : of the sphere, once per dwell in each direction [m]
+    lower, upper : range [m]; period : between readings [ns]; batch : readings in a message
+    outliers, outlier : share of readings, standard deviation [m]
+    """
+
+    azimuth: np.ndarray
+    tilt: np.ndarray
+    direction_error: float
+    position_error: float
+    noise: float
+    dwell_noise: float
+    lower: float
+    upper: float
+    period: int
+    batch: int
+    outliers: float = 0.0
+    outlier: float = 0.0
+
+    @property
+    def directions(self) -> np.ndarray:
+        """(gauges, 3) V_i of Eq. 2-3 as designed, frame ``table``: the way that pushes it in."""
+        flat = np.cos(self.tilt)
+        return np.column_stack(
+            [flat * np.cos(self.azimuth), flat * np.sin(self.azimuth), -np.sin(self.tilt)]
+        )
+
+
+@dataclass(frozen=True)
+class Nest:
+    """A nest as it was mounted once.
+
+    directions : (gauges, 3) unit vectors, frame ``table``
+    origin : (3,) sphere centre at which every gauge reads zero, frame ``table`` [m]
+    """
+
+    directions: np.ndarray
+    origin: np.ndarray
+
+    def read(self, sphere: np.ndarray) -> np.ndarray:
+        """(n, gauges) d_i = V_i . x [m] of sphere centres (n, 3), frame ``table`` (Eq. 2-3)."""
+        return (sphere - self.origin) @ self.directions.T
+
+
+def mount(data: GaugeData, sphere: np.ndarray, rng: np.random.Generator) -> Nest:
+    """Put the nest under the nominal sphere centre (3,) [m], as well as it can be done by hand."""
+    directions = data.directions + data.direction_error * rng.standard_normal((len(data.tilt), 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    return Nest(directions, sphere + data.position_error * rng.standard_normal(3))
+
+
+def limit(data: GaugeData, readings: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Readings held at the ends of the range, and their status (n, gauges) uint8."""
+    held = np.clip(readings, data.lower, data.upper)
+    status = np.where(held == readings, Status.VALID, Status.OUT_OF_RANGE).astype(np.uint8)
+    return held, status

@@ -1,0 +1,47 @@
+"""What `rtest info` says, on sessions from outside and on files that are hardly one."""
+
+from pathlib import Path
+
+import pytest
+
+from rtest_drivers.info import describe
+from rtest_drivers.mcap_file import McapFile
+from rtest_drivers.message_types import MessageTypes
+from rtest_estimation.errors import UserError
+
+SHARED = Path(__file__).resolve().parents[3].parent / 'shared' / 'sessions'
+
+
+@pytest.mark.skipif(
+    not SHARED.is_dir(), reason='the independent sessions are not beside the project'
+)
+def test_independent_session():
+    lines = describe(SHARED / 'open' / 'open-00')
+    text = '\n'.join(lines)
+    assert 'session   open-00' in lines
+    assert 'closed    yes' in lines
+    assert 'lost      0 readings' in lines
+    assert 'duration  249.3 s' in lines
+    assert sum(line.startswith('plan ') for line in lines) == 8
+    assert '1a-static: static, 86 poses of X Y Z B C, sphere at (0, -90, 40.6) mm' in text
+    assert any('/rtest/gauges' in line and '1816 messages' in line for line in lines)
+    assert not any(line.startswith('warning') for line in lines)
+
+
+def test_a_file_that_is_no_session_is_described_with_the_reason(tmp_path):
+    file = McapFile(tmp_path / 'short')
+    definition = MessageTypes().definition('std_msgs/msg/String')
+    file.add_topic('/log', definition.name, definition.text, definition.type_hash)
+    file.write('/log', 1_700_000_000_000_000_000, 0, 0, b'\0\1\0\0\1\0\0\0\0')
+    file.flush()
+    lines = describe(file.path)
+    assert 'closed    no' in lines
+    assert any('/log' in line and '1 messages' in line for line in lines)
+    assert any('was not closed' in line for line in lines)
+    assert any('no gauge readings' in line for line in lines)
+    assert len(describe(McapFile(tmp_path / 'empty').path)) >= 4
+
+
+def test_nothing_there(tmp_path):
+    with pytest.raises(UserError, match='no such file'):
+        describe(tmp_path / 'absent')

@@ -1,0 +1,87 @@
+"""The launch file starts what `rtest session` starts; `launch` itself is played."""
+
+from __future__ import annotations
+
+import runpy
+import sys
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+
+import pytest
+
+from rtest_drivers.config import config_path
+from rtest_drivers.graph import GraphSettings, session_nodes
+
+LAUNCH_FILE = Path(__file__).parents[1] / 'launch' / 'session.launch.py'
+
+
+class _Configuration:
+    def __init__(self, name: str) -> None:
+        self.name = name
+
+    def perform(self, context: dict[str, str]) -> str:
+        return context[self.name]
+
+
+def _recorded(kind: str):
+    return lambda *args, **kwargs: SimpleNamespace(kind=kind, args=args, **kwargs)
+
+
+@pytest.fixture
+def launch_file(monkeypatch):
+    """What the launch file defines, run with stand-ins for launch and launch_ros."""
+    for module, names in {
+        'launch': {'LaunchContext': dict, 'LaunchDescription': list},
+        'launch.actions': {
+            name: _recorded(name)
+            for name in (
+                'DeclareLaunchArgument', 'OpaqueFunction', 'SetEnvironmentVariable', 'Shutdown',
+            )
+        },
+        'launch.substitutions': {'LaunchConfiguration': _Configuration},
+        'launch_ros': {},
+        'launch_ros.actions': {name: _recorded(name) for name in ('LifecycleNode', 'Node')},
+    }.items():
+        stand_in = ModuleType(module)
+        vars(stand_in).update(names)
+        monkeypatch.setitem(sys.modules, module, stand_in)
+    return runpy.run_path(str(LAUNCH_FILE))
+
+
+def start(launch_file, **chosen: str) -> list[SimpleNamespace]:
+    """Nodes that are launched with these arguments."""
+    *before, opaque = launch_file['generate_launch_description']()
+    context = {a.args[0]: a.default_value for a in before if a.kind == 'DeclareLaunchArgument'}
+    assert set(chosen) <= set(context)
+    return opaque.function(context | chosen)
+
+
+def test_same_nodes_and_parameters_as_the_runner(launch_file, tmp_path):
+    nodes = start(
+        launch_file, session='monday', out=str(tmp_path), namespace='cell_1', rate='2.0',
+        simulate=str(config_path('cell_demo.yaml')),
+    )
+    address = next(n for n in nodes if n.name == 'cell').parameters[0]['address']
+    settings = GraphSettings(
+        config_path('demo.yaml'), 'monday', tmp_path, config_path('cell_demo.yaml'), rate=2.0,
+        address=address,
+    )
+    expected = session_nodes(settings)
+    assert [n.name for n in nodes] == [n.name for n in expected]
+    for node, other in zip(nodes, expected, strict=True):
+        assert (node.package, node.executable) == (other.package, other.name)
+        assert node.parameters == [other.parameters]
+        assert node.kind == ('LifecycleNode' if other.lifecycle else 'Node')
+        assert node.namespace == 'cell_1' and node.on_exit.kind == 'Shutdown'
+
+
+def test_real_drivers_are_not_started(launch_file):
+    assert not {'cell', 'gauges', 'cnc'} & {node.name for node in start(launch_file)}
+
+
+def test_every_executable_is_installed(launch_file, tmp_path):
+    sources = LAUNCH_FILE.parents[2]
+    for node in start(launch_file, simulate=str(config_path('cell_demo.yaml'))):
+        assert f"'{node.executable} = {node.package}.nodes.{node.executable}:main'" in (
+            sources / node.package / 'setup.py'
+        ).read_text()

@@ -1,0 +1,82 @@
+"""The recordings in bags/: they open, identify, and give again what the nodes published."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rtest_drivers.info import describe
+from rtest_drivers.sim.check import check
+from rtest_estimation.recording import read_recording
+from rtest_identification.offline import identify_recording
+from rtest_identification.output import as_dict, write
+
+ROOT = Path(__file__).resolve().parents[1]
+BAGS = ROOT / 'bags'
+TRUTH = ROOT / 'src' / 'rtest_drivers' / 'config' / 'cell_demo.yaml'
+
+
+def found(name):
+    data = as_dict(identify_recording(BAGS / name))
+    return {**data['location_errors'], **data['squareness']}
+
+
+def test_every_bag_is_described_and_read():
+    readme = (BAGS / 'README.md').read_text()
+    bags = sorted(path.parent.name for path in BAGS.glob('*/metadata.yaml'))
+    assert bags == ['open-01', 'short']
+    for name in bags:
+        assert f'`{name}`' in readme
+        assert read_recording(BAGS / name).closed
+        assert any('nest' in line for line in describe(BAGS / name))
+
+
+def test_command_and_node_agree_bit_for_bit():
+    recording = read_recording(BAGS / 'short')
+    published = recording.location_errors[-1]
+    data = identify_recording(BAGS / 'short')
+    assert list(published.symbols) == list(data.location.symbols)
+    np.testing.assert_array_equal(published.values, data.location.value)
+    np.testing.assert_array_equal(published.covariance, data.location.covariance.ravel())
+    assert published.residual == data.fit.rms
+
+
+def test_the_truth_of_the_simulated_cell_comes_back(tmp_path):
+    paths = write(identify_recording(BAGS / 'short'), tmp_path)
+    comparison = check(TRUTH, paths['json'])
+    assert all(row.ok for row in comparison.constants), comparison.table()
+    assert not comparison.missing
+
+
+def test_the_truth_of_the_independent_simulation_comes_back():
+    truth = json.loads((BAGS / 'open-01.truth.json').read_text())
+    values = found('open-01')
+    z = {
+        symbol: (values[symbol]['value'] - value) / values[symbol]['stddev']
+        for symbol, value in {**truth['location'], **truth['square']}.items()
+    }
+    assert len(z) == 11 and max(map(abs, z.values())) < 3.5, z
+
+
+def test_the_report_is_one_file_that_opens_offline(tmp_path):
+    paths = write(identify_recording(BAGS / 'short'), tmp_path)
+    page = paths['report'].read_text()
+    assert 'E_A(0B)C' in page and 'data:image/png;base64,' in page
+    assert 'http://' not in page and 'https://' not in page
+    assert {p.name for p in tmp_path.iterdir()} >= {
+        'identification.json', 'report.html', 'error_map_B.png', 'error_map_B.svg',
+        'residuals.png', 'residuals.svg',
+    }
+
+
+@pytest.mark.parametrize('share', [0.2, 0.5, 0.9, 0.999])
+def test_a_cut_recording_keeps_what_it_holds(tmp_path, share):
+    source = BAGS / 'short' / 'short.mcap'
+    cut = tmp_path / 'cut.mcap'
+    cut.write_bytes(source.read_bytes()[: int(share * source.stat().st_size)])
+    recording = read_recording(cut)
+    assert not recording.closed
+    assert any('cut' in warning for warning in recording.warnings)
+    whole = read_recording(BAGS / 'short')
+    assert len(recording.gauges) > 0.8 * share * len(whole.gauges) - 50

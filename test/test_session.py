@@ -1,0 +1,217 @@
+"""Whole sessions over DDS: every node a process, the simulated cell as the hardware."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+
+from rtest_drivers.config import config_path
+from rtest_drivers.runner import free_domain
+from rtest_drivers.sim.check import check
+from rtest_estimation.recording import read_recording
+
+pytestmark = [
+    pytest.mark.graph,
+    pytest.mark.skipif(
+        not (find_spec('rclpy') and find_spec('rtest_msgs')), reason='needs ROS 2 and rtest_msgs'
+    ),
+]
+
+CONFIG = """
+machine: {machine}
+cycle: {{b_deg: [-60, 0, 60], c_deg: [0, 90, 180, 270], dwell_s: 0.3}}
+nest_calibration: {{step_mm: 1.0, dwell_s: 0.3}}
+setups:
+  1a: {{sphere_mm: [0, -90.0, 40.6]}}
+"""
+NODES = ('recorder', 'estimator', 'identifier', 'cell', 'gauges', 'cnc', 'session')
+
+
+class Session:
+    """`rtest session` of one set-up, 3 B x 4 C, in a folder and a ROS domain of its own."""
+
+    def __init__(self, folder: Path, *more: str) -> None:
+        self.out = folder / 'out'
+        config = folder / 'short.yaml'
+        config.write_text(CONFIG.format(machine=config_path('nmv1500dcg.yaml')))
+        self.process = subprocess.Popen(
+            [
+                sys.executable, '-m', 'rtest_drivers.cli', 'session', '--config', str(config),
+                '--simulate', str(config_path('cell_demo.yaml')), '--session', 'short',
+                '--out', str(self.out), '--domain', str(free_domain()), *more,
+            ],
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=folder,
+            env={**os.environ, 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'},
+        )
+
+    def end(self, timeout: float = 90.0) -> tuple[int, str, str]:
+        out, err = self.process.communicate(timeout=timeout)
+        return self.process.returncode, out, err
+
+    def wait_for_cycle(self) -> None:
+        """Wait until the first cycle is finished."""
+        for line in self.process.stdout:
+            if '1a-nest:' in line and 'residual' in line:
+                return
+        pytest.fail(self.process.stderr.read())
+
+    def pids(self) -> dict[str, int]:
+        """Process ids of the nodes by name: those that run in the folder of the test."""
+        found = {}
+        for entry in Path('/proc').glob('[0-9]*'):
+            try:
+                words = (entry / 'cmdline').read_bytes().decode(errors='replace').split('\0')
+                here = Path(os.readlink(entry / 'cwd')) == self.out.parent
+            except OSError:
+                continue
+            for name in (word.rpartition('.nodes.')[2] for word in words if '.nodes.' in word):
+                if here and name in NODES:
+                    found[name] = int(entry.name)
+        return found
+
+    def shared_memory(self) -> set[Path]:
+        """Fast DDS segments that belong to the nodes."""
+        found = set()
+        for pid in self.pids().values():
+            maps = Path(f'/proc/{pid}/maps').read_text()
+            found |= set(re.findall(r'/dev/shm/fastrtps_[0-9a-f]{16}', maps))
+        return {Path(name) for name in found}
+
+    def nothing_runs(self) -> bool:
+        """Whether every process of the session ends within some seconds."""
+        deadline = time.monotonic() + 15.0
+        while self.pids():
+            if time.monotonic() > deadline:
+                return False
+            time.sleep(0.1)
+        return True
+
+
+@pytest.fixture
+def start(tmp_path):
+    """Starts a session; nothing of it is left after the test, whatever happens."""
+    sessions = []
+
+    def begin(*more: str) -> Session:
+        sessions.append(Session(tmp_path, *more))
+        return sessions[-1]
+
+    yield begin
+    for session in sessions:
+        session.process.kill()
+        session.process.communicate()
+        session.nothing_runs()
+        for pid in session.pids().values():
+            os.kill(pid, signal.SIGKILL)
+
+
+def test_a_session_from_calibration_to_identification(start, tmp_path):
+    session = start()
+    status, out, err = session.end()
+    assert status == 0, out + err
+    assert '1/2 1a-nest: ' in out and '2/2 1a-static: 14 of 14 poses' in out
+    assert out.splitlines()[-1].startswith('short: ')
+    assert session.nothing_runs()
+
+    recording = read_recording(session.out / 'short')
+    assert recording.closed and recording.lost == 0
+    assert {'/rtest/machine', '/rtest/plan', '/rtest/gauges', '/rtest/cnc/feedback', '/rtest/nest',
+            '/rtest/cycle', '/rtest/location_errors', '/rtest/error_map', '/diagnostics'} <= set(
+        recording.topics
+    )
+    assert recording.gauges[0].sequence == 0, 'the first reading is in the recording'
+
+    # The command finds in the recording what the node published, bit for bit.
+    path = session.out / 'short' / 'identification' / 'identification.json'
+    found = json.loads(path.read_text())
+    offline = {**found['location_errors'], **found['squareness']}
+    live = recording.location_errors[-1]
+    published = dict(zip(live.symbols, live.values.tolist(), strict=True))
+    assert offline and all(published[s] == entry['value'] for s, entry in offline.items())
+
+    # One set-up does not tell everything; what it does tell agrees with the truth.
+    rows = check(config_path('cell_demo.yaml'), path).constants
+    lengths = [row for row in rows if row.symbol in ('E_X(0Y)B', 'E_Y(0Y)B')]
+    assert lengths and all(abs(row.value - row.given) < 20e-6 for row in lengths)
+
+
+def test_a_node_that_dies_ends_the_session_and_the_recording_opens(start):
+    session = start()
+    session.wait_for_cycle()
+    segments = session.shared_memory()
+    os.kill(session.pids()['estimator'], signal.SIGKILL)
+    status, _, err = session.end()
+    assert status == 1
+    assert 'node estimator was killed by SIGKILL' in err and 'short.mcap' in err
+    assert session.nothing_runs()
+    assert segments and not any(segment.exists() for segment in segments)
+    assert read_recording(session.out / 'short').closed
+
+
+@pytest.mark.parametrize('signum', [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupted_session_is_closed_properly(start, signum):
+    session = start()
+    session.wait_for_cycle()
+    session.process.send_signal(signum)
+    status, _, err = session.end()
+    assert status == 128 + signum and signum.name in err and 'Traceback' not in err
+    assert session.nothing_runs()
+    recording = read_recording(session.out / 'short')
+    assert recording.closed and len(recording.cycles) >= 1
+
+
+def test_a_killed_runner_leaves_no_process_and_a_recording_that_opens(start):
+    session = start()
+    session.wait_for_cycle()
+    segments = session.shared_memory()
+    session.process.kill()
+    session.process.communicate()
+    assert session.nothing_runs()
+    assert segments and not any(segment.exists() for segment in segments)
+    assert read_recording(session.out / 'short').closed
+
+
+def test_a_session_in_a_namespace_with_a_remapped_topic(start):
+    session = start('--namespace', 'hall/cell_1', '--remap', 'rtest/gauges:=probe/readings')
+    status, out, err = session.end()
+    assert status == 0, out + err
+    topics = read_recording(session.out / 'short').topics
+    assert '/hall/cell_1/probe/readings' in topics and '/hall/cell_1/rtest/cycle' in topics
+
+
+def test_a_mistake_in_the_truth_file_is_one_line(start, tmp_path):
+    truth = tmp_path / 'truth.yaml'
+    truth.write_text('machine: nowhere.yaml\n')
+    session = start('--simulate', str(truth))
+    status, _, err = session.end()
+    assert status == 2 and err.startswith('rtest: ') and err.count('\n') == 1
+    assert session.nothing_runs()
+
+
+def test_missing_drivers_are_named(tmp_path):
+    """Without a cell and without drivers in the graph."""
+    config = tmp_path / 'short.yaml'
+    config.write_text(CONFIG.format(machine=config_path('nmv1500dcg.yaml')))
+    done = subprocess.run(
+        [
+            sys.executable, '-m', 'rtest_drivers.nodes.session', '--ros-args',
+            '-p', f'config:={config}', '-p', 'ready_timeout:=3.0',
+        ],
+        capture_output=True, text=True, timeout=60,
+        env={
+            **os.environ, 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
+            'ROS_DOMAIN_ID': str(free_domain()),
+        },
+    )
+    assert done.returncode == 1
+    assert 'gauges, cnc, estimator, identifier, recorder' in done.stderr
+    assert 'Traceback' not in done.stderr
