@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rtest_estimation.errors import UserError
-from rtest_estimation.recording import ROLES
 
 if TYPE_CHECKING:
     from rtest_identification.pipeline import Identification
@@ -44,6 +43,8 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _topics(chosen: list[str]) -> dict[str, str]:
+    from rtest_estimation.recording import ROLES
+
     topics = dict(text.partition('=')[::2] for text in chosen)
     for role, name in topics.items():
         if role not in ROLES or not name.startswith('/'):
