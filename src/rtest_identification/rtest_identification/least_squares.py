@@ -14,6 +14,7 @@ class Solution:
     """Minimum-norm least-squares solution in scaled unknowns.
 
     value : (p,); cofactor : (p, p) covariance over the variance factor
+    inverse : (p, n) value per observation
     rank, condition : of the scaled design, condition of the determined part
     determined : (p,) bool, False where an unknown takes part in what the data leave open
     nullspace : (p, p - rank) directions the data leave open, in scaled unknowns
@@ -21,6 +22,7 @@ class Solution:
 
     value: np.ndarray
     cofactor: np.ndarray
+    inverse: np.ndarray
     rank: int
     condition: float
     determined: np.ndarray
@@ -41,7 +43,7 @@ def solve(design: np.ndarray, observed: np.ndarray, scale: np.ndarray) -> Soluti
     u, s, vt = np.linalg.svd(design * scale, full_matrices=False)
     rank = int(np.sum(s > RANK_TOLERANCE * s[0])) if len(s) and s[0] > 0 else 0
     kept = vt[:rank].T / s[:rank]
-    value = (scale * (kept @ (u[:, :rank].T @ observed)).T).T
+    inverse = scale[:, None] * (kept @ u[:, :rank].T)
     cofactor = (kept @ kept.T) * np.outer(scale, scale)
     # What vt does not span completes it: the complement of the kept right singular vectors.
     complement = np.eye(count) - vt[:rank].T @ vt[:rank]
@@ -49,4 +51,4 @@ def solve(design: np.ndarray, observed: np.ndarray, scale: np.ndarray) -> Soluti
     nullspace = vectors[:, values > 0.5]
     determined = np.sqrt((nullspace**2).sum(axis=1)) < 1e-3
     condition = float(s[0] / s[rank - 1]) if rank else float('inf')
-    return Solution(value, cofactor, rank, condition, determined, nullspace)
+    return Solution(inverse @ observed, cofactor, inverse, rank, condition, determined, nullspace)

@@ -9,12 +9,13 @@ equally well the smallest is taken.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import stats
-from scipy.sparse.csgraph import connected_components
 
+from rtest_identification.error_map import AxisMap, coupled, stations, zero_mean
+from rtest_identification.grid_map import GridMap, fit_grid
 from rtest_identification.least_squares import Solution, solve
 from rtest_identification.observations import Observations
 from rtest_identification.symbols import (
@@ -24,8 +25,6 @@ from rtest_identification.symbols import (
     parameter,
 )
 
-# Stations closer than this are one station [rad].
-STATION = 1e-3
 # The map takes part in the location errors where it is there with this significance.
 MAP_SIGNIFICANCE = 0.01
 # A point this improbable under the fit (chi-squared, over all points) is an outlier.
@@ -40,6 +39,7 @@ class Estimate:
     value : (p,) [m] or [rad]; covariance : (p, p)
     determined : (p,) bool; the value of an undetermined one means nothing
     freedom : degrees of freedom of the residual the covariance rests on
+    gain : (p, n, 3) change of each value per displacement of each observation
     """
 
     parameters: tuple[ErrorParameter, ...]
@@ -49,6 +49,7 @@ class Estimate:
     rank: int
     condition: float
     freedom: int
+    gain: np.ndarray
 
     @property
     def symbols(self) -> tuple[str, ...]:
@@ -62,32 +63,6 @@ class Estimate:
 
 
 @dataclass(frozen=True)
-class AxisMap:
-    """Position-dependent errors of one rotary axis at its stations.
-
-    stations : (s,) [rad]; value, stddev : (6, s) in the order of `parameters` [m] or [rad]
-    covariance : (6 s, 6 s), parameters first
-    left_open : names of shapes that these data do not tell from constant errors
-    significance : probability of a map this large where there is none
-    """
-
-    axis: str
-    parameters: tuple[ErrorParameter, ...]
-    stations: np.ndarray
-    value: np.ndarray
-    covariance: np.ndarray
-    rank: int
-    condition: float
-    left_open: tuple[str, ...]
-    significance: float
-
-    @property
-    def stddev(self) -> np.ndarray:
-        """(6, s) standard uncertainties."""
-        return np.sqrt(np.diag(self.covariance)).reshape(self.value.shape)
-
-
-@dataclass(frozen=True)
 class Fit:
     """What a session's static cycles give.
 
@@ -98,6 +73,8 @@ class Fit:
     rms_location : the same with the location errors alone
     outliers : rows of the observations that were left out
     joint : whether the location errors were fitted together with the map
+    inner_map : of the inner rotary axis, from what all this leaves; None where it has too few
+        stations or the spheres determine nothing of it beyond noise
     """
 
     location: Estimate
@@ -107,22 +84,26 @@ class Fit:
     rms_location: float
     outliers: np.ndarray
     joint: bool
+    inner_map: GridMap | None = None
 
 
 def fit(observations: Observations) -> Fit:
-    """Identify location errors, squareness and the outer axis's map, leaving outliers out."""
+    """Identify location errors, squareness and the maps of both rotary axes, without outliers."""
     rows = np.arange(len(observations))
     while True:
         kept = observations.keep(rows)
-        result = _fit(kept)
+        result, explained, jacobian = _fit(kept)
         bad = _outliers(result.residual)
         if not bad.any() or np.sum(~bad) < 0.8 * len(observations):
-            left_out = np.setdiff1d(np.arange(len(observations)), rows)
-            return Fit(**{**vars(result), 'outliers': left_out})
+            break
         rows = rows[~bad]
+    left_out = np.setdiff1d(np.arange(len(observations)), rows)
+    inner = fit_grid(kept, jacobian, result.residual, _orthonormal(explained))
+    return replace(result, outliers=left_out, inner_map=inner)
 
 
-def _fit(observations: Observations) -> Fit:
+def _fit(observations: Observations) -> tuple[Fit, np.ndarray, np.ndarray]:
+    """The fit, the columns (3 n, p) it explains the displacements by, and the full Jacobian."""
     constants = location_parameters(observations.machine)
     columns = [p.column for p in constants]
     weights = _Whitening(observations.covariance, 0.0)
@@ -145,14 +126,18 @@ def _fit(observations: Observations) -> Fit:
         if (np.abs(change / scale[: len(errors)]) <= 1e-12).all():
             break
     unit = _variance(weights.rows(residual), freedom)
-    location = _location(constants, errors, first, unit * first.cofactor, freedom)
+    gain = weights.gain(first.inverse)
+    location = _location(constants, errors, first, unit * first.cofactor, freedom, gain)
     none = np.empty(0, dtype=int)
     alone = Fit(location, None, residual, rms, rms, none, False)
     outer = observations.machine.rotary[0] if observations.machine.rotary else None
-    stations, station = _stations(observations.axis(outer)) if outer else (np.empty(0), none)
-    if len(stations) < 3:
-        return alone
-    return _with_map(observations, alone, outer, (stations, station), (design, jacobian, weights))
+    places, station = stations(observations.axis(outer)) if outer else (np.empty(0), none)
+    linear = (design, jacobian, weights)
+    if len(places) < 3:
+        return alone, design.reshape(residual.size, -1), jacobian
+    result, effect = _with_map(observations, alone, outer, (places, station), linear)
+    both = np.concatenate([design, effect], axis=2)
+    return result, both.reshape(residual.size, -1), jacobian
 
 
 def _with_map(
@@ -161,15 +146,15 @@ def _with_map(
     axis: str,
     grid: tuple[np.ndarray, np.ndarray],
     linear: tuple[np.ndarray, np.ndarray, _Whitening],
-) -> Fit:
-    """Add the map of `axis` to the location errors (Eq. 3-23)."""
-    stations, station = grid
+) -> tuple[Fit, np.ndarray]:
+    """Add the map of `axis` to the location errors (Eq. 3-23); also its design (n, 3, p)."""
+    places, station = grid
     design, jacobian, weights = linear
     parameters = map_parameters(observations.machine, axis)
-    count, size = len(stations), len(design[0, 0])
+    count, size = len(places), len(design[0, 0])
     # Unknowns: coordinates in the space of sequences of mean zero over the stations.
-    zero_mean = _zero_mean(count)
-    spread = zero_mean[station]
+    contrasts = zero_mean(count)
+    spread = contrasts[station]
     columns = [parameter(observations.machine, axis, p.letter).column for p in parameters]
     effect = np.einsum('nip,ns->nips', jacobian[:, :, columns], spread)
     effect = effect.reshape(len(observations), 3, -1)
@@ -192,12 +177,14 @@ def _with_map(
     after = float((weights.rows(residual) ** 2).sum())
     f = ((before - after) / max(second.rank, 1)) / (after / freedom) if after > 0 else np.inf
     significance = float(stats.f.sf(f, second.rank, freedom))
-    turn = np.kron(np.eye(len(parameters)), zero_mean)
+    free_inverse = second.inverse - (second.inverse @ base) @ base.T
+    turn = np.kron(np.eye(len(parameters)), contrasts)
     covariance = turn @ (unit * second.cofactor) @ turn.T
     value = (turn @ coordinates).reshape(len(parameters), count)
     error_map = AxisMap(
-        axis, parameters, stations, value, covariance, second.rank, second.condition,
-        _left_open(parameters, turn @ (second.nullspace * scale[:, None])), significance,
+        axis, parameters, places, value, covariance, second.rank, second.condition,
+        coupled(parameters, turn @ (second.nullspace * scale[:, None])), significance,
+        weights.gain(turn @ free_inverse),
     )
     rms = float(np.sqrt((residual**2).sum() / freedom))
     joint = significance < MAP_SIGNIFICANCE
@@ -205,12 +192,12 @@ def _with_map(
     if joint:
         carry = solve(a, b, scale_a).value
         total = unit * (shift.cofactor + carry @ second.cofactor @ carry.T)
-        values = np.concatenate([location.value, np.zeros(size - len(location.value))])
+        moved = location.value + shift.value[: len(location.value)]
+        gain = shift.inverse - carry @ free_inverse
         location = _location(
-            location.parameters, (values + shift.value)[: len(location.value)], shift, total,
-            freedom,
+            location.parameters, moved, shift, total, freedom, weights.gain(gain)
         )
-    return Fit(location, error_map, residual, rms, alone.rms, alone.outliers, joint)
+    return Fit(location, error_map, residual, rms, alone.rms, alone.outliers, joint), effect
 
 
 def _location(
@@ -219,11 +206,12 @@ def _location(
     solution: Solution,
     covariance: np.ndarray,
     freedom: int,
+    gain: np.ndarray,
 ) -> Estimate:
     count = len(parameters)
     return Estimate(
         parameters, value[:count], covariance[:count, :count], solution.determined[:count],
-        solution.rank, solution.condition, freedom,
+        solution.rank, solution.condition, freedom, gain[:count],
     )
 
 
@@ -244,6 +232,11 @@ class _Whitening:
         return white.reshape(-1, *values.shape[2:])
 
 
+    def gain(self, inverse: np.ndarray) -> np.ndarray:
+        """(p, 3 n) per whitened row to (p, n, 3) per displacement."""
+        return np.einsum('pni,nij->pnj', inverse.reshape(len(inverse), -1, 3), self.factor)
+
+
 def _variance(white: np.ndarray, freedom: int) -> float:
     """Variance factor of whitened residuals."""
     return float((white**2).sum() / freedom)
@@ -252,49 +245,6 @@ def _variance(white: np.ndarray, freedom: int) -> float:
 def _orthonormal(design: np.ndarray) -> np.ndarray:
     u, s, _ = np.linalg.svd(design / np.linalg.norm(design, axis=0), full_matrices=False)
     return u[:, s > 1e-9 * s[0]]
-
-
-def _zero_mean(count: int) -> np.ndarray:
-    """(count, count - 1) orthonormal basis of the sequences of mean zero (Helmert contrasts)."""
-    basis = np.zeros((count, count - 1))
-    for k in range(1, count):
-        basis[:k, k - 1] = 1.0
-        basis[k, k - 1] = -k
-        basis[:, k - 1] /= np.sqrt(k * (k + 1))
-    return basis
-
-
-def _stations(positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Stations of an axis and, for every row, which one it is at."""
-    order = np.argsort(positions)
-    group = np.concatenate([[0], np.cumsum(np.diff(positions[order]) > STATION)])
-    station = np.empty(len(positions), dtype=int)
-    station[order] = group
-    return np.array([positions[station == g].mean() for g in range(group[-1] + 1)]), station
-
-
-def _left_open(parameters: tuple[ErrorParameter, ...], nullspace: np.ndarray) -> tuple[str, ...]:
-    """Groups of symbols whose shapes over the stations the data do not tell from constants.
-
-    The projector on what is left open couples the symbols that make up one shape; symbols it does
-    not couple are named apart.
-    """
-    if not nullspace.shape[1]:
-        return ()
-    scale = np.repeat([p.scale for p in parameters], len(nullspace) // len(parameters))
-    basis = np.linalg.qr(nullspace / scale[:, None])[0]
-    parts = basis.reshape(len(parameters), -1, basis.shape[1])
-    coupling = np.einsum('ask,btk->asbt', parts, parts)
-    linked = np.sqrt((coupling**2).sum(axis=(1, 3))) > 0.05
-    count, label = connected_components(linked, directed=False)
-    groups = []
-    for group in range(count):
-        members = [i for i in range(len(parameters)) if label[i] == group and linked[i, i]]
-        if members:
-            names = ', '.join(parameters[i].symbol for i in members)
-            shapes = round(sum(float((parts[i] ** 2).sum()) for i in members))
-            groups.append(f'{names} ({shapes} shape{"s" if shapes != 1 else ""})')
-    return tuple(groups)
 
 
 def _outliers(residual: np.ndarray) -> np.ndarray:

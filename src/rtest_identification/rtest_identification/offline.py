@@ -12,6 +12,7 @@ from rtest_estimation.pipeline import EstimationRules, Estimator, Finished
 from rtest_estimation.recording import Recording, read_recording
 from rtest_identification.machine import load_machine, parse_machine
 from rtest_identification.pipeline import Identification, identify
+from rtest_identification.uncertainty import load_priors
 
 
 def estimate_recording(
@@ -47,11 +48,13 @@ def identify_recording(
     machine_path: Path | str | None = None,
     progress: Callable[[str], None] = lambda line: None,
     topics: Mapping[str, str] | None = None,
+    priors_path: Path | str | None = None,
 ) -> Identification:
     """Identify the machine from a recording alone.
 
     machine_path : another machine file than the recorded one
     topics : role to topic name, as in `rtest_estimation.recording.read_recording`
+    priors_path : file of what is known of the linear axes' error motions
 
     Raises UserError naming file and what is expected.
     """
@@ -62,9 +65,10 @@ def identify_recording(
         machine = parse_machine(recording.machine_text, f'{path}: /rtest/machine')
     else:
         raise UserError(f'{path}: no machine was recorded; give its file with --machine')
+    priors = load_priors(priors_path, machine) if priors_path is not None else None
     finished = estimate_recording(recording, None, progress)
     try:
-        result = identify(machine, [f.cycle for f in finished])
+        result = identify(machine, [f.cycle for f in finished], priors)
     except UserError as error:
         problems = '; '.join(dict.fromkeys(f.problem for f in finished if f.problem))
         raise UserError(f'{path}: {error}' + (f' ({problems})' if problems else '')) from None

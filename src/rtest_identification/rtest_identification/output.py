@@ -8,9 +8,14 @@ import os
 from pathlib import Path
 from typing import Any
 
-from rtest_identification.location import AxisMap, Estimate
+import numpy as np
+
+from rtest_identification.error_map import AxisMap
+from rtest_identification.grid_map import GridMap
+from rtest_identification.location import Estimate
 from rtest_identification.pipeline import Identification, Unused
 from rtest_identification.report import render
+from rtest_identification.uncertainty import COVERAGE_FACTOR
 
 
 def as_dict(result: Identification) -> dict[str, Any]:
@@ -22,17 +27,14 @@ def as_dict(result: Identification) -> dict[str, Any]:
         'machine': result.machine.name,
         'location_errors': _named(location, rotary),
         'squareness': _named(location, [not r for r in rotary]),
-        'error_maps': {m.axis: _map(m) for m in result.maps},
+        'error_maps': {m.axis: _map(m) for m in result.maps} | _inner(result.inner_map),
         'residual_rms': result.fit.rms,
         'residual_rms_location_errors_only': result.fit.rms_location,
         'noise': _number(result.noise),
         'degrees_of_freedom': location.freedom,
         'rank': location.rank,
         'condition': _number(location.condition),
-        'correlation': {
-            'symbols': list(location.symbols),
-            'covariance': location.covariance.tolist(),
-        },
+        'uncertainty': _uncertainty(result),
         'undetermined': [
             s for s, good in zip(location.symbols, location.determined, strict=True) if not good
         ],
@@ -69,6 +71,27 @@ def _atomic(path: Path, text: str) -> None:
     os.replace(part, path)
 
 
+def _uncertainty(result: Identification) -> dict[str, Any]:
+    """Contributions (standard uncertainties), degrees of freedom, U (k = 2), correlations."""
+    shares, symbols = result.budget, result.location.symbols
+
+    def named(values: np.ndarray) -> dict[str, float]:
+        return dict(zip(symbols, values.tolist(), strict=True))
+
+    return {
+        'symbols': list(symbols),
+        'coverage_factor': COVERAGE_FACTOR,
+        'expanded': named(COVERAGE_FACTOR * result.location.stddev),
+        'contributions': {
+            name: named(np.sqrt(np.diag(part))) for name, part in shares.parts.items()
+        },
+        'degrees_of_freedom': named(shares.freedom),
+        'interval_factor_95': named(shares.interval_factor),
+        'correlation': shares.correlation.tolist(),
+        'covariance': shares.total.tolist(),
+    }
+
+
 def _named(location: Estimate, chosen: list[bool]) -> dict[str, Any]:
     stddev = location.stddev
     return {
@@ -92,6 +115,30 @@ def _map(error_map: AxisMap) -> dict[str, Any]:
         'condition': _number(error_map.condition),
         'significance': error_map.significance,
         'left_open': list(error_map.left_open),
+    }
+
+
+def _inner(grid: GridMap | None) -> dict[str, Any]:
+    """The inner axis's map, [b][c] a symbol; null where the data do not determine it."""
+    if grid is None:
+        return {}
+
+    def rows(values: np.ndarray) -> list[list[float | None]]:
+        return [[_number(v) for v in row] for row in values]
+
+    symbols = [p.symbol for p in grid.parameters]
+    return {
+        grid.axis: {
+            'b_rad': grid.outer.tolist(),
+            'c_rad': grid.inner.tolist(),
+            **dict(zip(symbols, map(rows, grid.value), strict=True)),
+            'stddev': dict(zip(symbols, map(rows, grid.stddev), strict=True)),
+            'residual_rms': grid.rms,
+            'degrees_of_freedom': grid.freedom,
+            'significance': grid.significance,
+            'undetermined': list(grid.undetermined),
+            'left_open': list(grid.left_open),
+        }
     }
 
 

@@ -10,12 +10,17 @@ from scipy import stats
 
 from rtest_estimation import runout as runouts
 from rtest_estimation.records import Cycle, Kind
-from rtest_identification.location import AxisMap, Estimate, Fit, fit
+from rtest_identification.error_map import AxisMap
+from rtest_identification.grid_map import GridMap
+from rtest_identification.location import MAP_SIGNIFICANCE, Estimate, Fit, fit
 from rtest_identification.machine import Machine
 from rtest_identification.observations import Observations, repeatability, stack
+from rtest_identification.uncertainty import AxisPrior, Budget, Sources, budget
 
 # A residual this improbable at the measured repeatability means that the model lacks something.
 MISFIT_PROBABILITY = 0.01
+# With fewer degrees of freedom a residual says little about the noise.
+MIN_FREEDOM = 30
 
 
 @dataclass(frozen=True)
@@ -33,6 +38,8 @@ class Identification:
 
     noise : repeatability of a pose, per component [m]; NaN where nothing was repeated
     runout : of the sphere against the spindle axis; None where it was not measured
+    budget : contributions to the uncertainty of the location errors
+    sources : where they come from, for Monte Carlo propagation
     """
 
     session: str
@@ -42,6 +49,8 @@ class Identification:
     noise: float
     noise_freedom: int
     runout: runouts.Runout | None
+    budget: Budget
+    sources: Sources
     outliers: tuple[Unused, ...]
     missing: tuple[Unused, ...]
     warnings: tuple[str, ...]
@@ -53,12 +62,21 @@ class Identification:
 
     @property
     def maps(self) -> tuple[AxisMap, ...]:
-        """Error maps that were identified."""
+        """Error maps over one axis: that of the outer rotary axis."""
         return (self.fit.error_map,) if self.fit.error_map else ()
 
+    @property
+    def inner_map(self) -> GridMap | None:
+        """Error map of the inner rotary axis over both; None where there is none to show."""
+        return self.fit.inner_map
 
-def identify(machine: Machine, cycles: Sequence[Cycle]) -> Identification:
+
+def identify(
+    machine: Machine, cycles: Sequence[Cycle], priors: dict[str, AxisPrior] | None = None
+) -> Identification:
     """Identify a machine from the finished cycles of one session.
+
+    priors : what is known of the error motions of the linear axes, by letter
 
     Raises UserError where there is nothing to identify from.
     """
@@ -79,9 +97,18 @@ def identify(machine: Machine, cycles: Sequence[Cycle]) -> Identification:
         )
     observations = stack(replace(machine, tool=machine.tool + offset), cycles)
     result = fit(observations)
-    if runout is not None:
-        result = _with_runout(observations, result, runout)
     noise, freedom = repeatability(cycles)
+    errors = np.zeros((len(machine.letters), 6))
+    errors.flat[[p.column for p in result.location.parameters]] = result.location.value
+    used = observations.keep(np.setdiff1d(np.arange(len(observations)), result.outliers))
+    across = None if runout is None else runout.covariance[:2, :2]
+    sources = Sources(used, errors, cycles, noise, across, priors)
+    result, shares = _with_sources(result, sources)
+    if not priors:
+        warnings.append(
+            'error motions of the linear axes are not in the uncertainty; give what is known of '
+            'them with --priors'
+        )
     warnings += _judge(result, noise, freedom)
     session = next((c.plan.session for c in cycles if c.plan.session), '')
     missing = tuple(
@@ -98,8 +125,8 @@ def identify(machine: Machine, cycles: Sequence[Cycle]) -> Identification:
         for row in result.outliers
     )
     return Identification(
-        session, machine, observations, result, noise, freedom, runout, outliers, missing,
-        tuple(warnings),
+        session, machine, observations, result, noise, freedom, runout, shares, sources, outliers,
+        missing, tuple(warnings),
     )
 
 
@@ -117,18 +144,18 @@ def _sphere_offset(cycle: Cycle) -> tuple[np.ndarray, runouts.Runout]:
     return np.append(towards, 0.0), circle
 
 
-def _with_runout(observations: Observations, result: Fit, runout: runouts.Runout) -> Fit:
-    """Carry the uncertainty of the sphere's offset to the location errors."""
-    step = 1e-6
-    slopes = []
-    machine = observations.machine
-    for direction in np.eye(3)[:2]:
-        shifted = replace(machine, tool=machine.tool + step * direction)
-        moved = replace(observations, machine=shifted)
-        slopes.append((fit(moved).location.value - result.location.value) / step)
-    gain = np.array(slopes).T
-    covariance = result.location.covariance + gain @ runout.covariance[:2, :2] @ gain.T
-    return replace(result, location=replace(result.location, covariance=covariance))
+def _with_sources(result: Fit, sources: Sources) -> tuple[Fit, Budget]:
+    """Add what does not show in the scatter of the fit to every covariance."""
+    shares = budget(result.location, sources)
+    location = replace(result.location, covariance=shares.total)
+    error_map, inner = result.error_map, result.inner_map
+    if error_map is not None:
+        more = sum(sources.carry(error_map.gain).values())
+        error_map = replace(error_map, covariance=error_map.covariance + more)
+    if inner is not None and sources.priors:
+        more = np.diag(sum(sources.carry(inner.gain).values())).reshape(inner.value.shape)
+        inner = replace(inner, stddev=np.sqrt(inner.stddev**2 + more))
+    return replace(result, location=location, error_map=error_map, inner_map=inner), shares
 
 
 def _judge(result: Fit, noise: float, freedom: int) -> list[str]:
@@ -147,11 +174,27 @@ def _judge(result: Fit, noise: float, freedom: int) -> list[str]:
         )
     if len(result.outliers):
         warnings.append(f'{len(result.outliers)} poses left out as outliers')
-    if freedom and result.rms > 0.0:
-        ratio = (result.rms / noise) ** 2
-        if stats.f.sf(ratio, location.freedom, freedom) < MISFIT_PROBABILITY:
+    inner = result.inner_map
+    # The richest model whose residual still has enough degrees of freedom to be judged.
+    rms, left = result.rms, location.freedom
+    if inner and inner.significance < MAP_SIGNIFICANCE and inner.freedom >= MIN_FREEDOM:
+        rms, left = inner.rms, inner.freedom
+    if inner and inner.undetermined:
+        warnings.append(
+            f'map of {inner.axis}: these sphere positions cannot tell '
+            f'{", ".join(inner.undetermined)} from each other at every pose; measure at other '
+            'heights and radii'
+        )
+    for group in inner.left_open if inner else ():
+        warnings.append(
+            f'map of {inner.axis}: {group} that turn with the table look like an offset of the '
+            'cycle and are kept out of the map'
+        )
+    if freedom and rms > 0.0:
+        ratio = (rms / noise) ** 2
+        if stats.f.sf(ratio, left, freedom) < MISFIT_PROBABILITY:
             warnings.append(
-                f'residual {result.rms * 1e6:.2f} um against a repeatability of '
+                f'residual {rms * 1e6:.2f} um against a repeatability of '
                 f'{noise * 1e6:.2f} um: the model lacks an effect (or the machine repeats less '
                 'well elsewhere than at the nest calibration); the values may be off by more '
                 'than their stated uncertainty'

@@ -88,3 +88,22 @@ def static_cycle(setup, errors_at, b=B, c=C):
         LETTERS, np.array(rows), 0.3,
     )
     return Cycle(plan, made, (), 'cal', plan.stamp + 10**11)
+
+
+def nest_cycle(setup, step=1e-3):
+    """A finished nest calibration of 28 positions (section 2.2.2), without noise."""
+    sphere = np.array(SETUPS[setup])
+    start = np.array([*sphere, 0.0, 0.0])
+    rows = []
+    for _ in range(3):
+        for axis in range(3):
+            rows += [start, start + step * np.eye(5)[axis], start - step * np.eye(5)[axis]]
+    rows = np.array([*rows, start])
+    points = tuple(
+        CyclePoint(n, n, row, np.zeros(5, np.int8), row[:3] - sphere, 1e-16 * np.eye(3), 10)
+        for n, row in enumerate(rows)
+    )
+    plan = CyclePlan(
+        1, 'made', f'{setup}-nest', Kind.NEST_CALIBRATION, setup, sphere, LETTERS, rows, 0.3
+    )
+    return Cycle(plan, points, (), 'cal', 2)

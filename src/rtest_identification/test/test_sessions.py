@@ -48,7 +48,19 @@ def test_sessions_without_hidden_effect_give_their_truth(name):
     assert not result.fit.joint
 
 
-@pytest.mark.parametrize('name', ['open-04', 'open-06'])
-def test_a_hidden_effect_is_not_passed_over_in_silence(name):
-    result, *_ = load(name)
+def test_a_hidden_effect_is_not_passed_over_in_silence():
+    # Pitch of Y, which no map of the rotary axes can take.
+    result, *_ = load('open-06')
     assert any('lacks an effect' in warning for warning in result.warnings)
+
+
+def test_a_hidden_run_out_of_c_is_in_its_map():
+    # Three waves a turn of 0.33 um in E_X and E_Y of C.
+    result, _, truth = load('open-04')
+    effect = truth['effects'][0]
+    assert effect['key'] == 'radial/C' and effect['k'] == 3
+    grid = result.inner_map
+    assert grid.axis == 'C' and grid.significance < 1e-6
+    assert result.fit.rms_location > 1.1 * truth['noise']
+    assert grid.rms == pytest.approx(truth['noise'], rel=0.15)
+    assert not any('lacks an effect' in warning for warning in result.warnings)

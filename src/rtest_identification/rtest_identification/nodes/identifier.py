@@ -30,7 +30,7 @@ class IdentifierNode(Node):
         self._result: Identification | None = None
         self._problem = 'waiting for the machine'
         self._location = self.create_publisher(LocationErrors, 'rtest/location_errors', LATCHED)
-        self._map = self.create_publisher(ErrorMap, 'rtest/error_map', LATCHED)
+        self._map = self.create_publisher(ErrorMap, 'rtest/error_map', LATCHED_100)
         self._diagnostics = diagnostics.Diagnostics(self)
         self.create_subscription(String, 'rtest/machine', self._on_machine, LATCHED)
         self.create_subscription(Cycle, 'rtest/cycle', self._on_cycle, LATCHED_100)
@@ -74,6 +74,8 @@ class IdentifierNode(Node):
         self._location.publish(publish.location_errors(result, stamp))
         for axis_map in result.maps:
             self._map.publish(publish.error_map(result, axis_map, stamp))
+        if result.inner_map is not None:
+            self._map.publish(publish.grid_map(result, result.inner_map, stamp))
 
     def _on_finish(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self._identify()

@@ -6,7 +6,8 @@ import numpy as np
 from rtest_msgs import msg
 
 from rtest_estimation.nodes.publish import header
-from rtest_identification.location import AxisMap
+from rtest_identification.error_map import AxisMap
+from rtest_identification.grid_map import GridMap
 from rtest_identification.pipeline import Identification
 
 
@@ -36,4 +37,19 @@ def error_map(result: Identification, axis_map: AxisMap, stamp: int) -> msg.Erro
         values=axis_map.value.ravel().tolist(),
         stddev=axis_map.stddev.ravel().tolist(),
         residual=result.fit.rms,
+    )
+
+
+def grid_map(result: Identification, grid: GridMap, stamp: int) -> msg.ErrorMap:
+    """The inner axis's map over both axes; NaN where the data do not determine it."""
+    return msg.ErrorMap(
+        header=header(stamp, 'machine'),
+        session=result.session,
+        axis=grid.axis,
+        symbols=[p.symbol for p in grid.parameters],
+        b=grid.outer.tolist(),
+        c=grid.inner.tolist(),
+        values=grid.value.ravel().tolist(),
+        stddev=grid.stddev.ravel().tolist(),
+        residual=grid.rms,
     )
