@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
-from rtest_identification.error_map import coupled, stations
+from rtest_identification.error_map import coupled, stations, zero_mean
 from rtest_identification.observations import Observations
 from rtest_identification.symbols import (
     RANK_TOLERANCE,
@@ -24,6 +24,8 @@ from rtest_identification.symbols import (
     parameter,
 )
 
+# With fewer degrees of freedom a residual says little about the noise, and nothing about a map.
+MIN_FREEDOM = 30
 # Fewer stations of the inner axis at a level of the outer one make no map.
 MIN_STATIONS = 3
 
@@ -38,7 +40,8 @@ class GridMap:
     left_open : groups of symbols with shapes that look like offsets of the cycles at every pose
     rms : of what is left with this map, per component [m]
     freedom : degrees of freedom of that residual
-    significance : probability of a map this large where there is none
+    significance : probability of a map this large where there is none; 1 where too little is
+        repeated to tell
     gain : (6 b c, n, 3) change of each value per displacement of each observation
     """
 
@@ -129,9 +132,31 @@ def fit_grid(
         inner_axis, parameters, outer, inner, value, np.sqrt(variance),
         tuple(p.symbol for p, out in zip(parameters, gone, strict=True) if out),
         _left_open(cells, explained @ shared, parameters, gone, value.shape),
-        float(np.sqrt(unit)), freedom, float(stats.f.sf(ratio, added, freedom)),
+        float(np.sqrt(unit)), freedom,
+        float(stats.f.sf(ratio, added, freedom)) if freedom >= MIN_FREEDOM else 1.0,
         _gain(cells, value.shape, len(observations)),
     )
+
+
+def contrasts(observations: Observations, jacobian: np.ndarray) -> np.ndarray:
+    """(n, 3, k) columns of every map of the inner axis with mean zero at each outer level."""
+    outer_axis, inner_axis = observations.machine.rotary
+    outer, at_outer = stations(observations.axis(outer_axis))
+    _, at_inner = stations(observations.axis(inner_axis))
+    parameters = map_parameters(observations.machine, inner_axis)
+    columns = [parameter(observations.machine, inner_axis, p.letter).column for p in parameters]
+    slopes = jacobian[:, :, columns] * [p.scale for p in parameters]
+    blocks = []
+    for level in range(len(outer)):
+        rows = np.flatnonzero(at_outer == level)
+        places, place = np.unique(at_inner[rows], return_inverse=True)
+        if len(places) < MIN_STATIONS:
+            continue
+        spread = zero_mean(len(places))[place]
+        block = np.zeros((len(observations), 3, 6 * spread.shape[1]))
+        block[rows] = np.einsum('nip,ns->nips', slopes[rows], spread).reshape(len(rows), 3, -1)
+        blocks.append(block)
+    return np.concatenate(blocks, axis=2)
 
 
 def _solve(

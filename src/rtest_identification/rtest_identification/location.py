@@ -9,16 +9,18 @@ equally well the smallest is taken.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import stats
 
 from rtest_identification.error_map import AxisMap, coupled, stations, zero_mean
-from rtest_identification.grid_map import GridMap, fit_grid
+from rtest_identification.grid_map import GridMap, contrasts, fit_grid
 from rtest_identification.least_squares import Solution, solve
 from rtest_identification.observations import Observations
 from rtest_identification.symbols import (
+    RANK_TOLERANCE,
     ErrorParameter,
     location_parameters,
     map_parameters,
@@ -75,6 +77,7 @@ class Fit:
     joint : whether the location errors were fitted together with the map
     inner_map : of the inner rotary axis, from what all this leaves; None where it has too few
         stations or the spheres determine nothing of it beyond noise
+    joint_inner : whether everything was fitted together with the inner map
     """
 
     location: Estimate
@@ -85,25 +88,53 @@ class Fit:
     outliers: np.ndarray
     joint: bool
     inner_map: GridMap | None = None
+    joint_inner: bool = False
 
 
-def fit(observations: Observations) -> Fit:
-    """Identify location errors, squareness and the maps of both rotary axes, without outliers."""
+# Columns (n, 3, k) of the effects of a model at some observations: called with these, the
+# Jacobian, and the displacement (n, 3) that the errors identified so far explain.
+Effects = Callable[[Observations, np.ndarray, np.ndarray], np.ndarray]
+
+
+def fit(observations: Observations, effects: Effects | None = None) -> Fit:
+    """Identify location errors, squareness and the maps of both rotary axes, without outliers.
+
+    effects : of a model that are free besides
+    """
     rows = np.arange(len(observations))
+    free = None
     while True:
         kept = observations.keep(rows)
         result, explained, jacobian = _fit(kept)
+        if effects is not None:
+            free = effects(kept, jacobian, kept.displacement - result.residual)
+            result, explained, jacobian = _fit(kept, free, result.rms)
         bad = _outliers(result.residual)
         if not bad.any() or np.sum(~bad) < 0.8 * len(observations):
             break
         rows = rows[~bad]
     left_out = np.setdiff1d(np.arange(len(observations)), rows)
-    inner = fit_grid(kept, jacobian, result.residual, _orthonormal(explained))
+    inner = fit_grid(kept, jacobian, result.residual, explained)
+    if inner and inner.significance < MAP_SIGNIFICANCE and not inner.undetermined:
+        # Waves of the inner axis look in part like squareness: they are fitted together.
+        waves = contrasts(kept, jacobian)
+        waves = waves if free is None else np.concatenate([waves, free], axis=2)
+        together, explained, jacobian = _fit(kept, waves, inner.rms)
+        if (together.location.determined >= result.location.determined).all():
+            again = fit_grid(kept, jacobian, together.residual, explained)
+            again = replace(again, significance=inner.significance)
+            result, inner = replace(together, joint_inner=True, rms=result.rms), again
     return replace(result, outliers=left_out, inner_map=inner)
 
 
-def _fit(observations: Observations) -> tuple[Fit, np.ndarray, np.ndarray]:
-    """The fit, the columns (3 n, p) it explains the displacements by, and the full Jacobian."""
+def _fit(
+    observations: Observations, absorbed: np.ndarray | None = None, noise: float = 0.0
+) -> tuple[Fit, np.ndarray, np.ndarray]:
+    """Fit, orthonormal basis (3 n, p) of what it explains, and the full Jacobian.
+
+    absorbed : (n, 3, k) columns that are free besides, whose values are not asked for
+    noise : of a component, where it is known better than from this fit [m]
+    """
     constants = location_parameters(observations.machine)
     columns = [p.column for p in constants]
     weights = _Whitening(observations.covariance, 0.0)
@@ -111,33 +142,42 @@ def _fit(observations: Observations) -> tuple[Fit, np.ndarray, np.ndarray]:
     table = np.zeros((len(observations.machine.letters), 6))
     offsets = observations.offsets()
     scale = np.concatenate([[p.scale for p in constants], np.ones(offsets.shape[2])])
-    for _ in range(_ITERATIONS):
+    for last in (False,) * (_ITERATIONS - 1) + (True,):
         table.flat[columns] = errors
         predicted, jacobian = observations.predict(table, jacobian=True)
         design = np.concatenate([jacobian[:, :, columns], offsets], axis=2)
         left = observations.displacement - predicted
         first = solve(weights.rows(design), weights.rows(left), scale)
         change = first.value[: len(errors)]
-        errors = errors + change
-        residual = left - design @ first.value
-        freedom = max(residual.size - first.rank, 1)
-        rms = float(np.sqrt((residual**2).sum() / freedom))
-        weights = _Whitening(observations.covariance, rms)
-        if (np.abs(change / scale[: len(errors)]) <= 1e-12).all():
+        if last or (np.abs(change / scale[: len(errors)]) <= 1e-12).all():
             break
+        errors = errors + change
+        rms = _rms(left - design @ first.value, first.rank)
+        weights = _Whitening(observations.covariance, rms)
+    if absorbed is not None:
+        weights = _Whitening(observations.covariance, noise)
+        weights.absorb(absorbed, weights.rows(design) * scale)
+        first = solve(weights.rows(design), weights.rows(left), scale)
+    errors = errors + first.value[: len(errors)]
+    residual = left - design @ first.value
+    freedom = max(residual.size - first.rank - weights.absorbed, 1)
     unit = _variance(weights.rows(residual), freedom)
     gain = weights.gain(first.inverse)
     location = _location(constants, errors, first, unit * first.cofactor, freedom, gain)
     none = np.empty(0, dtype=int)
+    rms = weights.typical * float(np.sqrt(unit))
     alone = Fit(location, None, residual, rms, rms, none, False)
     outer = observations.machine.rotary[0] if observations.machine.rotary else None
     places, station = stations(observations.axis(outer)) if outer else (np.empty(0), none)
     linear = (design, jacobian, weights)
+    flat = design.reshape(residual.size, -1)
     if len(places) < 3:
-        return alone, design.reshape(residual.size, -1), jacobian
+        return alone, _orthonormal(flat, scale), jacobian
     result, effect = _with_map(observations, alone, outer, (places, station), linear)
-    both = np.concatenate([design, effect], axis=2)
-    return result, both.reshape(residual.size, -1), jacobian
+    flat = np.concatenate([flat, effect.reshape(residual.size, -1)], axis=1)
+    scale = np.append(scale, np.repeat([p.scale for p in result.error_map.parameters],
+                                       len(places) - 1))
+    return result, _orthonormal(flat, scale), jacobian
 
 
 def _with_map(
@@ -153,32 +193,33 @@ def _with_map(
     parameters = map_parameters(observations.machine, axis)
     count, size = len(places), len(design[0, 0])
     # Unknowns: coordinates in the space of sequences of mean zero over the stations.
-    contrasts = zero_mean(count)
-    spread = contrasts[station]
+    waves = zero_mean(count)
+    spread = waves[station]
     columns = [parameter(observations.machine, axis, p.letter).column for p in parameters]
     effect = np.einsum('nip,ns->nips', jacobian[:, :, columns], spread)
     effect = effect.reshape(len(observations), 3, -1)
     scale = np.repeat([p.scale for p in parameters], count - 1)
     a, b = weights.rows(design), weights.rows(effect)
     y = weights.rows(alone.residual)
-    base = _orthonormal(a)
-    free = b - base @ (base.T @ b)
-    second = solve(free, y - base @ (base.T @ y), scale)
-    coordinates = second.value
     scale_a = np.concatenate(
         [[p.scale for p in alone.location.parameters], np.ones(size - len(alone.location.value))]
     )
+    # The same rank as the fit of the constants has, or the map would take what they leave open.
+    base = _orthonormal(a, scale_a)
+    free = b - base @ (base.T @ b)
+    second = solve(free, y - base @ (base.T @ y), scale)
+    coordinates = second.value
     # What the map takes away from the constants: shift of the first solution.
     shift = solve(a, y - b @ coordinates, scale_a)
     residual = alone.residual - effect @ coordinates - design @ shift.value
-    freedom = max(residual.size - shift.rank - second.rank, 1)
+    freedom = max(residual.size - shift.rank - second.rank - weights.absorbed, 1)
     unit = _variance(weights.rows(residual), freedom)
     before = float((weights.rows(alone.residual) ** 2).sum())
     after = float((weights.rows(residual) ** 2).sum())
     f = ((before - after) / max(second.rank, 1)) / (after / freedom) if after > 0 else np.inf
     significance = float(stats.f.sf(f, second.rank, freedom))
     free_inverse = second.inverse - (second.inverse @ base) @ base.T
-    turn = np.kron(np.eye(len(parameters)), contrasts)
+    turn = np.kron(np.eye(len(parameters)), waves)
     covariance = turn @ (unit * second.cofactor) @ turn.T
     value = (turn @ coordinates).reshape(len(parameters), count)
     error_map = AxisMap(
@@ -186,7 +227,7 @@ def _with_map(
         coupled(parameters, turn @ (second.nullspace * scale[:, None])), significance,
         weights.gain(turn @ free_inverse),
     )
-    rms = float(np.sqrt((residual**2).sum() / freedom))
+    rms = weights.typical * float(np.sqrt(unit))
     joint = significance < MAP_SIGNIFICANCE
     location = alone.location
     if joint:
@@ -216,7 +257,10 @@ def _location(
 
 
 class _Whitening:
-    """Scales rows to unit variance: scatter of the readings plus what differs between dwells."""
+    """Scales rows to unit variance: scatter of the readings plus what differs between dwells.
+
+    absorbed : how many columns are taken out of every row
+    """
 
     def __init__(self, covariance: np.ndarray, rms: float) -> None:
         readings = float(np.trace(covariance, axis1=1, axis2=2).mean()) / 3.0
@@ -225,16 +269,41 @@ class _Whitening:
             covariance, dwell = np.zeros_like(covariance), 1.0
         total = covariance + dwell * np.eye(3)
         self.factor = np.linalg.inv(np.linalg.cholesky(total))
+        self.typical = float(np.sqrt(np.trace(total, axis1=1, axis2=2).mean() / 3.0))
+        self._basis: np.ndarray | None = None
+        self.absorbed = 0
+
+    def absorb(self, columns: np.ndarray, kept: np.ndarray) -> None:
+        """Take columns (n, 3, k) out of every row from now on.
+
+        What the `kept` columns (3 n, p) can make as well stays theirs: a wave that looks like the
+        offset of a cycle is one.
+        """
+        white = self.rows(columns)
+        basis = _orthonormal(white, 1.0 / np.linalg.norm(white, axis=0))
+        u, s, _ = np.linalg.svd(basis.T @ _orthonormal(kept, np.ones(kept.shape[1])))
+        shared = int(np.sum(s > 1.0 - 1e-6))
+        self._basis = basis @ u[:, shared:]
+        self.absorbed = self._basis.shape[1]
 
     def rows(self, values: np.ndarray) -> np.ndarray:
         """(n, 3) or (n, 3, p) to whitened (3 n,) or (3 n, p)."""
         white = np.einsum('nij,nj...->ni...', self.factor, values)
-        return white.reshape(-1, *values.shape[2:])
-
+        return self._free(white.reshape(-1, *values.shape[2:]))
 
     def gain(self, inverse: np.ndarray) -> np.ndarray:
         """(p, 3 n) per whitened row to (p, n, 3) per displacement."""
+        inverse = self._free(inverse.T).T
         return np.einsum('pni,nij->pnj', inverse.reshape(len(inverse), -1, 3), self.factor)
+
+    def _free(self, white: np.ndarray) -> np.ndarray:
+        if self._basis is None:
+            return white
+        return white - self._basis @ (self._basis.T @ white)
+
+
+def _rms(residual: np.ndarray, rank: int) -> float:
+    return float(np.sqrt((residual**2).sum() / max(residual.size - rank, 1)))
 
 
 def _variance(white: np.ndarray, freedom: int) -> float:
@@ -242,9 +311,10 @@ def _variance(white: np.ndarray, freedom: int) -> float:
     return float((white**2).sum() / freedom)
 
 
-def _orthonormal(design: np.ndarray) -> np.ndarray:
-    u, s, _ = np.linalg.svd(design / np.linalg.norm(design, axis=0), full_matrices=False)
-    return u[:, s > 1e-9 * s[0]]
+def _orthonormal(design: np.ndarray, scale: np.ndarray) -> np.ndarray:
+    """Orthonormal basis of columns, of the rank that `solve` finds with this scale."""
+    u, s, _ = np.linalg.svd(design * scale, full_matrices=False)
+    return u[:, s > RANK_TOLERANCE * s[0]]
 
 
 def _outliers(residual: np.ndarray) -> np.ndarray:

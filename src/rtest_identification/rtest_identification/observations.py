@@ -22,6 +22,8 @@ class Observations:
     covariance : (n, 3, 3) of it, from the scatter of the readings [m2]
     sphere : (n, 3) nominal sphere centre, frame ``table`` [m]
     cycle : (n,) index into `cycles`; pose : (n,) row of its plan
+    approach : (n, axes) sign of each axis's last motion before, in the order of the letters
+    stamp : (n,) int64 middle of the readings [ns]
     """
 
     machine: Machine
@@ -33,6 +35,8 @@ class Observations:
     sphere: np.ndarray
     cycle: np.ndarray
     pose: np.ndarray
+    approach: np.ndarray
+    stamp: np.ndarray
 
     def __len__(self) -> int:
         return len(self.pose)
@@ -43,7 +47,10 @@ class Observations:
 
     def keep(self, rows: np.ndarray) -> Observations:
         """Only these rows (bool mask or indices)."""
-        names = ('positions', 'displacement', 'covariance', 'sphere', 'cycle', 'pose')
+        names = (
+            'positions', 'displacement', 'covariance', 'sphere', 'cycle', 'pose', 'approach',
+            'stamp',
+        )
         return replace(self, **{name: getattr(self, name)[rows] for name in names})
 
     def offsets(self) -> np.ndarray:
@@ -73,7 +80,7 @@ def stack(machine: Machine, cycles: Sequence[Cycle]) -> Observations:
             'no static cycle with a valid point in this session; '
             'see the missing poses and their reasons in `rtest info`'
         )
-    positions, rows = [], []
+    positions, approach, rows = [], [], []
     for number, cycle in enumerate(static):
         axes = cycle.plan.axes
         absent = [name for name in machine.letters if name not in axes]
@@ -85,6 +92,7 @@ def stack(machine: Machine, cycles: Sequence[Cycle]) -> Observations:
         order = [axes.index(name) for name in machine.letters]
         for point in cycle.points:
             positions.append(point.feedback[order])
+            approach.append(point.approach[order])
             rows.append((number, cycle, point))
     return Observations(
         machine,
@@ -96,6 +104,8 @@ def stack(machine: Machine, cycles: Sequence[Cycle]) -> Observations:
         np.array([cycle.plan.sphere for _, cycle, _ in rows]),
         np.array([number for number, _, _ in rows]),
         np.array([point.index for _, _, point in rows]),
+        np.array(approach),
+        np.array([point.stamp for _, _, point in rows], dtype=np.int64),
     )
 
 

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import heapq
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 
 from rtest_estimation.errors import UserError
+from rtest_estimation.missing import grouped
 from rtest_estimation.pipeline import EstimationRules, Estimator, Finished
 from rtest_estimation.recording import Recording, read_recording
+from rtest_identification.gap.model_file import load_model, model_columns
 from rtest_identification.machine import load_machine, parse_machine
 from rtest_identification.pipeline import Identification, identify
 from rtest_identification.uncertainty import load_priors
@@ -43,18 +45,32 @@ def estimate_recording(
     return done
 
 
+def lost_cycles(finished: Iterable[Finished]) -> list[str]:
+    """Why cycles have no point, for example `1a-static 0-85: no gauge readings`."""
+    lines = []
+    for item in finished:
+        if not item.cycle.points:
+            name, reasons = item.cycle.plan.cycle, grouped(item.cycle.missing)
+            told = item.problem in {missing.reason for missing in item.cycle.missing}
+            lines += [f'{name} {line}' for line in reasons]
+            lines += [f'{name}: {item.problem}'] if item.problem and not told else []
+    return lines
+
+
 def identify_recording(
     path: Path | str,
     machine_path: Path | str | None = None,
     progress: Callable[[str], None] = lambda line: None,
     topics: Mapping[str, str] | None = None,
     priors_path: Path | str | None = None,
+    model_path: Path | str | None = None,
 ) -> Identification:
     """Identify the machine from a recording alone.
 
     machine_path : another machine file than the recorded one
     topics : role to topic name, as in `rtest_estimation.recording.read_recording`
     priors_path : file of what is known of the linear axes' error motions
+    model_path : file of a model whose effects are free besides
 
     Raises UserError naming file and what is expected.
     """
@@ -66,12 +82,15 @@ def identify_recording(
     else:
         raise UserError(f'{path}: no machine was recorded; give its file with --machine')
     priors = load_priors(priors_path, machine) if priors_path is not None else None
+    model = load_model(model_path) if model_path is not None else None
     finished = estimate_recording(recording, None, progress)
+    directions = {f.nest.setup: f.nest.direction for f in finished if f.nest is not None}
+    effects = model_columns(model, recording.plans[0].stamp, directions) if model else None
     try:
-        result = identify(machine, [f.cycle for f in finished], priors)
+        result = identify(machine, [f.cycle for f in finished], priors, effects)
     except UserError as error:
-        problems = '; '.join(dict.fromkeys(f.problem for f in finished if f.problem))
-        raise UserError(f'{path}: {error}' + (f' ({problems})' if problems else '')) from None
+        why = '; '.join(lost_cycles(finished))
+        raise UserError(f'{path}: {error}' + (f' ({why})' if why else '')) from None
     problems = tuple(f'{f.cycle.plan.cycle}: {f.problem}' for f in finished if f.problem)
     warnings = (*recording.warnings, *problems, *result.warnings)
     return replace(result, warnings=warnings, session=result.session or recording.session)

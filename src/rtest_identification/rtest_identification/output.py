@@ -11,14 +11,17 @@ from typing import Any
 import numpy as np
 
 from rtest_identification.error_map import AxisMap
+from rtest_identification.field_sources import covariances_as_json
 from rtest_identification.grid_map import GridMap
 from rtest_identification.location import Estimate
 from rtest_identification.pipeline import Identification, Unused
 from rtest_identification.report import render
 from rtest_identification.uncertainty import COVERAGE_FACTOR
+from rtest_identification.verdict import Verdict
+from rtest_identification.verdict_table import as_json
 
 
-def as_dict(result: Identification) -> dict[str, Any]:
+def as_dict(result: Identification, verdict: Verdict | None = None) -> dict[str, Any]:
     """The identification as JSON data; SI units, numbers unrounded."""
     location = result.location
     rotary = [p.axis in result.machine.rotary for p in location.parameters]
@@ -27,7 +30,7 @@ def as_dict(result: Identification) -> dict[str, Any]:
         'machine': result.machine.name,
         'location_errors': _named(location, rotary),
         'squareness': _named(location, [not r for r in rotary]),
-        'error_maps': {m.axis: _map(m) for m in result.maps} | _inner(result.inner_map),
+        'error_maps': _maps(result),
         'residual_rms': result.fit.rms,
         'residual_rms_location_errors_only': result.fit.rms_location,
         'noise': _number(result.noise),
@@ -46,22 +49,30 @@ def as_dict(result: Identification) -> dict[str, Any]:
             'residual': result.runout.residual,
         },
         'fitted_with_map': result.fit.joint,
+        'fitted_with_inner_map': result.fit.joint_inner,
         'poses': len(result.observations),
         'outliers': [_unused(item) for item in result.outliers],
         'missing': [_unused(item) for item in result.missing],
         'warnings': list(result.warnings),
+        'notes': list(result.notes),
+        'gauge_disagreement': dict(result.disagreement),
+        **({'verdict': as_json(verdict)} if verdict else {}),
     }
 
 
-def write(result: Identification, out: Path) -> dict[str, Path]:
+def write(
+    result: Identification, out: Path, verdict: Verdict | None = None
+) -> dict[str, Path]:
     """Write identification.json and report.html into `out`; returns the paths by name.
+
+    verdict : by a tolerance file, where one was given
 
     Each file appears whole or not at all.
     """
     out.mkdir(parents=True, exist_ok=True)
     paths = {'json': out / 'identification.json', 'report': out / 'report.html'}
-    _atomic(paths['json'], json.dumps(as_dict(result), indent=1, allow_nan=False) + '\n')
-    _atomic(paths['report'], render(result, out))
+    _atomic(paths['json'], json.dumps(as_dict(result, verdict), indent=1, allow_nan=False) + '\n')
+    _atomic(paths['report'], render(result, out, verdict))
     return paths
 
 
@@ -103,6 +114,13 @@ def _named(location: Estimate, chosen: list[bool]) -> dict[str, Any]:
         for i, p in enumerate(location.parameters)
         if chosen[i] and location.determined[i]
     }
+
+
+def _maps(result: Identification) -> dict[str, Any]:
+    maps = {m.axis: _map(m) for m in result.maps} | _inner(result.inner_map)
+    for axis, covariances in covariances_as_json(result).items():
+        maps[axis].update(covariances)
+    return maps
 
 
 def _map(error_map: AxisMap) -> dict[str, Any]:

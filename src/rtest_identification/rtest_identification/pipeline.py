@@ -3,24 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy import stats
 
 from rtest_estimation import runout as runouts
+from rtest_estimation.errors import UserError
 from rtest_estimation.records import Cycle, Kind
 from rtest_identification.error_map import AxisMap
 from rtest_identification.grid_map import GridMap
-from rtest_identification.location import MAP_SIGNIFICANCE, Estimate, Fit, fit
+from rtest_identification.location import MAP_SIGNIFICANCE, Effects, Estimate, Fit, fit
 from rtest_identification.machine import Machine
 from rtest_identification.observations import Observations, repeatability, stack
 from rtest_identification.uncertainty import AxisPrior, Budget, Sources, budget
 
 # A residual this improbable at the measured repeatability means that the model lacks something.
 MISFIT_PROBABILITY = 0.01
-# With fewer degrees of freedom a residual says little about the noise.
-MIN_FREEDOM = 30
+# Errors and residuals beyond these are not errors of a machine but another machine [m], [rad].
+LARGEST_RESIDUAL, LARGEST_LENGTH, LARGEST_ANGLE = 1e-3, 5e-3, 0.02
 
 
 @dataclass(frozen=True)
@@ -40,6 +41,9 @@ class Identification:
     runout : of the sphere against the spindle axis; None where it was not measured
     budget : contributions to the uncertainty of the location errors
     sources : where they come from, for Monte Carlo propagation
+    warnings : what to mend or mind before using the numbers; notes : what holds for every R-test
+    disagreement : rms of what more than three gauges leave of each other, by cycle [m]
+    poses : planned in all static cycles, measured or not
     """
 
     session: str
@@ -54,6 +58,9 @@ class Identification:
     outliers: tuple[Unused, ...]
     missing: tuple[Unused, ...]
     warnings: tuple[str, ...]
+    notes: tuple[str, ...] = ()
+    disagreement: dict[str, float] = field(default_factory=dict)
+    poses: int = 0
 
     @property
     def location(self) -> Estimate:
@@ -72,11 +79,15 @@ class Identification:
 
 
 def identify(
-    machine: Machine, cycles: Sequence[Cycle], priors: dict[str, AxisPrior] | None = None
+    machine: Machine,
+    cycles: Sequence[Cycle],
+    priors: dict[str, AxisPrior] | None = None,
+    effects: Effects | None = None,
 ) -> Identification:
     """Identify a machine from the finished cycles of one session.
 
     priors : what is known of the error motions of the linear axes, by letter
+    effects : of a model that are free besides
 
     Raises UserError where there is nothing to identify from.
     """
@@ -96,7 +107,8 @@ def identify(
             'the rotary axes across the spindle contain it'
         )
     observations = stack(replace(machine, tool=machine.tool + offset), cycles)
-    result = fit(observations)
+    result = fit(observations, effects)
+    _refuse_other_machine(machine, result)
     noise, freedom = repeatability(cycles)
     errors = np.zeros((len(machine.letters), 6))
     errors.flat[[p.column for p in result.location.parameters]] = result.location.value
@@ -104,12 +116,8 @@ def identify(
     across = None if runout is None else runout.covariance[:2, :2]
     sources = Sources(used, errors, cycles, noise, across, priors)
     result, shares = _with_sources(result, sources)
-    if not priors:
-        warnings.append(
-            'error motions of the linear axes are not in the uncertainty; give what is known of '
-            'them with --priors'
-        )
-    warnings += _judge(result, noise, freedom)
+    found, notes = _judge(result, noise, freedom)
+    warnings += found
     session = next((c.plan.session for c in cycles if c.plan.session), '')
     missing = tuple(
         Unused(cycle.plan.cycle, item.index, item.reason)
@@ -126,8 +134,24 @@ def identify(
     )
     return Identification(
         session, machine, observations, result, noise, freedom, runout, shares, sources, outliers,
-        missing, tuple(warnings),
+        missing, tuple(warnings), tuple(notes) + _about_priors(priors), _disagreement(cycles),
+        sum(len(cycle.plan.commands) for cycle in cycles if cycle.plan.kind is Kind.STATIC),
     )
+
+
+def _refuse_other_machine(machine: Machine, result: Fit) -> None:
+    """Raise UserError where the machine file cannot be that of the recording."""
+    location = result.location
+    text = f'machine {machine.name!r} does not fit this recording: '
+    hint = '; check chain, direction and sense of the axes in the machine file'
+    if result.rms > LARGEST_RESIDUAL:
+        raise UserError(f'{text}residual {result.rms * 1e3:.1f} mm{hint}')
+    for p, value, good in zip(
+        location.parameters, location.value, location.determined, strict=True
+    ):
+        limit = LARGEST_ANGLE if p.angular else LARGEST_LENGTH
+        if good and abs(value) > limit:
+            raise UserError(f'{text}{p.symbol} would be {value:.3g} {p.unit}{hint}')
 
 
 def _sphere_offset(cycle: Cycle) -> tuple[np.ndarray, runouts.Runout]:
@@ -158,9 +182,28 @@ def _with_sources(result: Fit, sources: Sources) -> tuple[Fit, Budget]:
     return replace(result, location=location, error_map=error_map, inner_map=inner), shares
 
 
-def _judge(result: Fit, noise: float, freedom: int) -> list[str]:
-    """What a user must know before trusting the numbers."""
-    warnings = []
+def _about_priors(priors: dict[str, AxisPrior] | None) -> tuple[str, ...]:
+    if priors:
+        return ()
+    return (
+        'error motions of the linear axes are not in the uncertainty, and often larger than it; '
+        'give what is known of them with --priors',
+    )
+
+
+def _disagreement(cycles: Sequence[Cycle]) -> dict[str, float]:
+    found = {}
+    for cycle in cycles:
+        values = [p.disagreement for p in cycle.points if p.disagreement > 0.0]
+        if values:
+            found[cycle.plan.cycle] = float(np.sqrt(np.mean(np.square(values))))
+    return found
+
+
+def _judge(result: Fit, noise: float, freedom: int) -> tuple[list[str], list[str]]:
+    """What a user must know before trusting the numbers: warnings, and notes."""
+    warnings: list[str] = []
+    notes: list[str] = []
     location = result.location
     lost = [s for s, good in zip(location.symbols, location.determined, strict=True) if not good]
     if lost:
@@ -168,7 +211,7 @@ def _judge(result: Fit, noise: float, freedom: int) -> list[str]:
             f'not determined by these poses: {", ".join(lost)}; measure another sphere position'
         )
     for group in result.error_map.left_open if result.error_map else ():
-        warnings.append(
+        notes.append(
             f'map of {result.error_map.axis}: {group} over its stations cannot be told from '
             'constant errors and is kept out of the map'
         )
@@ -177,7 +220,7 @@ def _judge(result: Fit, noise: float, freedom: int) -> list[str]:
     inner = result.inner_map
     # The richest model whose residual still has enough degrees of freedom to be judged.
     rms, left = result.rms, location.freedom
-    if inner and inner.significance < MAP_SIGNIFICANCE and inner.freedom >= MIN_FREEDOM:
+    if inner and inner.significance < MAP_SIGNIFICANCE:
         rms, left = inner.rms, inner.freedom
     if inner and inner.undetermined:
         warnings.append(
@@ -186,7 +229,7 @@ def _judge(result: Fit, noise: float, freedom: int) -> list[str]:
             'heights and radii'
         )
     for group in inner.left_open if inner else ():
-        warnings.append(
+        notes.append(
             f'map of {inner.axis}: {group} that turn with the table look like an offset of the '
             'cycle and are kept out of the map'
         )
@@ -194,11 +237,22 @@ def _judge(result: Fit, noise: float, freedom: int) -> list[str]:
         ratio = (rms / noise) ** 2
         if stats.f.sf(ratio, left, freedom) < MISFIT_PROBABILITY:
             warnings.append(
-                f'residual {rms * 1e6:.2f} um against a repeatability of '
-                f'{noise * 1e6:.2f} um: the model lacks an effect (or the machine repeats less '
+                f'residual {rms * 1e6:.2f} µm against a repeatability of '
+                f'{noise * 1e6:.2f} µm: the model lacks an effect (or the machine repeats less '
                 'well elsewhere than at the nest calibration); the values may be off by more '
                 'than their stated uncertainty'
             )
+    if result.joint:
+        notes.append(
+            f'errors of {result.error_map.axis} change with it: the location errors are means '
+            'over its stations, fitted together with the map'
+        )
+    if inner and inner.significance < MAP_SIGNIFICANCE and not result.joint_inner:
+        warnings.append(
+            f'errors of {inner.axis} change with it, and these set-ups cannot fit squareness and '
+            f'location errors together with its map: they may be off by more than their stated '
+            'uncertainty; measure more sphere positions'
+        )
     if not freedom:
         warnings.append('no repeated poses: the residual cannot be judged against the noise')
-    return warnings
+    return warnings, notes

@@ -3,35 +3,25 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from rtest_estimation.errors import UserError
 from rtest_estimation.records import CyclePlan, Kind
 from rtest_identification.kinematics import linear_positions
-from rtest_identification.machine import Machine, load_machine
+from rtest_identification.machine import Machine
 
 SPINDLE = 'S'
-_KEYS = {
-    'machine', 'sphere_radius_mm', 'cycle', 'nest_calibration', 'spindle_runout', 'setups',
-}
-
-
-@dataclass(frozen=True)
-class SessionConfig:
-    """What is to be measured in a session.
-
-    sphere_radius : [m]
-    plans : in order, each with stamp 0 and an empty session name until it is started
-    """
-
-    machine: Machine
-    sphere_radius: float
-    plans: tuple[CyclePlan, ...]
+# Twelve uneven stations of a full turn. Even ones show harmonic n and 12 - n as one and the same;
+# of these the sum of exp(i n C) is at most 0.33 of the number of stations for every n up to 22, so
+# that no harmonic up to 11 looks like another (cosine at most 0.83 beside location errors), and
+# the first five are still found together (condition 3.4). Found by search over multiples of 5 deg
+# with gaps of 10 to 50 deg.
+UNEVEN_DEG = (0, 50, 60, 80, 110, 145, 160, 200, 240, 270, 315, 335)
+# How far an outermost level is overrun before it is approached from outside: more than any
+# backlash and enough to be a pose of its own, less than what counts as another station [rad].
+OVERRUN = math.radians(0.05)
 
 
 def nest_calibration(
@@ -80,19 +70,58 @@ def static(
         (B and C of Table 3-1). The inner axis goes to and fro, so that it need not rewind. The
         cycle starts and ends with both at zero.
     """
+    poses = [(0.0, 0.0), *_sweep(outer, inner), (0.0, 0.0)]
+    commands = linear_positions(machine, sphere, _rotary(machine, poses))
+    return _plan(machine, Kind.STATIC, setup, 'static', sphere, commands, dwell)
+
+
+def diagnostic(
+    machine: Machine,
+    setup: str,
+    sphere: np.ndarray,
+    outer: np.ndarray,
+    inner: np.ndarray,
+    dwell: float = 0.3,
+) -> CyclePlan:
+    """A cycle that separates what the thesis's static one leaves together.
+
+    All levels of the outer axis upwards, then all downwards, so that every level is approached
+    from both sides (backlash); in the second pass the inner axis goes the other way at each level.
+    The first pose is visited again between the passes and at the end (drift, which is then no
+    function of the outer axis). Before the outermost levels the outer axis overruns them by
+    `OVERRUN`, a measured pose of the same station.
+
+    outer, inner : as in `static`; uneven stations of a full turn (`UNEVEN_DEG`) separate its
+        harmonics. They are visited in ascending order.
+    """
+    outer, inner = np.sort(outer), np.sort(inner)
+    upward = _sweep(outer, inner)
+    downward = upward[::-1]
+    zero = (0.0, 0.0)
+    below = (outer[0] - OVERRUN, upward[0][1])
+    above = (outer[-1] + OVERRUN, downward[0][1])
+    poses = [zero, below, *upward, zero, above, *downward, zero]
+    commands = linear_positions(machine, sphere, _rotary(machine, poses))
+    return _plan(machine, Kind.STATIC, setup, 'diagnostic', sphere, commands, dwell)
+
+
+def _sweep(outer: np.ndarray, inner: np.ndarray) -> list[tuple[float, float]]:
+    """Every level of the outer axis in turn, the inner axis to and fro."""
+    return [
+        (float(angle), float(station))
+        for level, angle in enumerate(outer)
+        for station in (inner if level % 2 == 0 else inner[::-1])
+    ]
+
+
+def _rotary(machine: Machine, poses: list[tuple[float, float]]) -> np.ndarray:
+    """(n, axes) with the two rotary axes at these poses, the others at zero."""
     names = machine.rotary
     if len(names) != 2:
         raise UserError(f'machine: a static cycle needs two rotary axes, got {list(names)}')
-    first, second = (machine.letters.index(name) for name in names)
-    rows = [np.zeros(len(machine.letters))]
-    for level, angle in enumerate(outer):
-        for station in inner if level % 2 == 0 else inner[::-1]:
-            row = np.zeros(len(machine.letters))
-            row[first], row[second] = angle, station
-            rows.append(row)
-    rows.append(rows[0])
-    commands = linear_positions(machine, sphere, np.array(rows))
-    return _plan(machine, Kind.STATIC, setup, 'static', sphere, commands, dwell)
+    rows = np.zeros((len(poses), len(machine.letters)))
+    rows[:, [machine.letters.index(name) for name in names]] = poses
+    return rows
 
 
 def _plan(
@@ -131,94 +160,3 @@ def check_ranges(machine: Machine, plan: CyclePlan) -> None:
                 f'{axis.lower * scale:.3f} to {axis.upper * scale:.3f} {unit}; '
                 'change the stations or the sphere position'
             )
-
-
-def load_session(path: Path | str) -> SessionConfig:
-    """Read a session file: machine, sphere, cycle, set-ups.
-
-    Raises UserError naming file, key and what is expected.
-    """
-    path = Path(path)
-    try:
-        data = yaml.safe_load(path.read_text(encoding='utf-8'))
-    except (OSError, UnicodeDecodeError) as error:
-        raise UserError(f'{path}: cannot read the session file: {error}') from None
-    except yaml.YAMLError as error:
-        raise UserError(f'{path}: not valid YAML: {" ".join(str(error).split())}') from None
-    if not isinstance(data, dict):
-        raise UserError(f'{path}: expected a mapping with machine, cycle and setups')
-    reader = _Reader(str(path), data)
-    reader.only(_KEYS)
-    machine = load_machine(path.parent / str(reader.required('machine')))
-    radius = reader.number('sphere_radius_mm', 12.7) * 1e-3
-    cycle = reader.section('cycle', {'b_deg', 'c_deg', 'dwell_s'})
-    outer, inner = (np.radians(cycle.numbers(key)) for key in ('b_deg', 'c_deg'))
-    dwell = cycle.number('dwell_s', 0.3)
-    nest = reader.section('nest_calibration', {'step_mm', 'dwell_s'})
-    step, nest_dwell = nest.number('step_mm', 1.0) * 1e-3, nest.number('dwell_s', 0.3)
-    plans: list[CyclePlan] = []
-    setups = reader.required('setups')
-    if not isinstance(setups, dict) or not setups:
-        raise UserError(f'{path}: setups: expected a mapping of names to sphere_mm')
-    for name, spec in setups.items():
-        setup = _Reader(f'{path}: setups: {name}', spec if isinstance(spec, dict) else {})
-        setup.only({'sphere_mm'})
-        sphere = np.array(setup.numbers('sphere_mm', 3)) * 1e-3
-        name = str(name)
-        plans.append(nest_calibration(machine, name, sphere, step, nest_dwell))
-        if not any(plan.kind is Kind.SPINDLE_RUNOUT for plan in plans):
-            runout = data.get('spindle_runout')
-            if runout is not None:
-                section = reader.section('spindle_runout', {'stations', 'dwell_s'})
-                stations = round(section.number('stations', 24))
-                plans.append(
-                    spindle_runout(machine, name, sphere, stations, section.number('dwell_s', 0.3))
-                )
-        plans.append(static(machine, name, sphere, outer, inner, dwell))
-    for plan in plans:
-        check_ranges(machine, plan)
-    return SessionConfig(machine, radius, tuple(plans))
-
-
-class _Reader:
-    """Typed look-ups in a YAML mapping whose errors name file and key."""
-
-    def __init__(self, where: str, data: dict) -> None:
-        self.where, self.data = where, data
-
-    def only(self, known: set[str]) -> None:
-        for key in self.data:
-            if key not in known:
-                raise UserError(
-                    f'{self.where}: unknown key {key!r}, expected one of {sorted(known)}'
-                )
-
-    def required(self, key: str) -> Any:
-        if key not in self.data:
-            raise UserError(f'{self.where}: {key}: missing')
-        return self.data[key]
-
-    def section(self, key: str, known: set[str]) -> _Reader:
-        value = self.data.get(key, {})
-        if not isinstance(value, dict):
-            raise UserError(f'{self.where}: {key}: expected a mapping of {sorted(known)}')
-        section = _Reader(f'{self.where}: {key}', value)
-        section.only(known)
-        return section
-
-    def number(self, key: str, default: float) -> float:
-        value = self.data.get(key, default)
-        if isinstance(value, bool) or not isinstance(value, int | float) or not value > 0:
-            raise UserError(f'{self.where}: {key}: expected a positive number, got {value!r}')
-        return float(value)
-
-    def numbers(self, key: str, count: int | None = None) -> list[float]:
-        value = self.required(key)
-        good = isinstance(value, list) and all(
-            isinstance(v, int | float) and not isinstance(v, bool) and math.isfinite(v)
-            for v in value
-        )
-        if not good or not value or (count and len(value) != count):
-            wanted = f'{count} numbers' if count else 'a list of numbers'
-            raise UserError(f'{self.where}: {key}: expected {wanted}, got {value!r}')
-        return [float(v) for v in value]

@@ -107,3 +107,22 @@ def nest_cycle(setup, step=1e-3):
         1, 'made', f'{setup}-nest', Kind.NEST_CALIBRATION, setup, sphere, LETTERS, rows, 0.3
     )
     return Cycle(plan, points, (), 'cal', 2)
+
+
+def chain_centre(chain, positions, errors, tool=(0.0, 0.0, 0.0)):
+    """Sphere in the table frame of any chain from table to tool; linear X Y Z, rotary A B C.
+
+    positions : axis to m or rad; errors : as for `centre`.
+    """
+    bed = chain.index('bed')
+
+    def side(names):
+        matrix = np.eye(4)
+        for name in names:
+            matrix = matrix @ defect(errors.get(name, {}))
+            q = positions[name]
+            matrix = matrix @ (turn(name, q) if name in 'ABC' else shift(**{name.lower(): q}))
+        return matrix
+
+    table, tool_side = side(chain[:bed][::-1]), side(chain[bed + 1 :])
+    return (np.linalg.inv(table) @ tool_side @ [*tool, 1])[:3]

@@ -10,6 +10,7 @@ from rtest_estimation.errors import UserError
 from rtest_identification.location import fit
 from rtest_identification.machine import parse_machine
 from rtest_identification.observations import stack
+from rtest_identification.pipeline import identify
 
 MACHINE = parse_machine(NMV)
 TRUTH = {
@@ -144,3 +145,25 @@ def test_a_machine_with_other_axes_is_refused():
 def test_nothing_measured_is_refused():
     with pytest.raises(UserError, match='no static cycle'):
         stack(MACHINE, [])
+
+
+@pytest.mark.parametrize('setups', [('2a',), ('1a',), ('2a', '2b')])
+def test_a_map_never_makes_the_fit_worse(setups):
+    # Also where constants are not determined.
+    rng = np.random.default_rng(15)
+    result = fit(stack(MACHINE, cycles(with_map, setups, noise=2.5e-7, rng=rng)))
+    assert (result.residual**2).sum() <= 1.001 * (
+        result.rms_location**2 * result.location.freedom + 1e-20
+    ) * 1.1
+    assert result.rms <= 1.05 * result.rms_location
+
+
+@pytest.mark.parametrize(
+    ('old', 'new'),
+    [('[0, 1, 0], sense: 1', '[0, 1, 0], sense: -1'), ('[0, 1, 0], sense', '[0, 0, 1], sense'),
+     ('[C, B, bed', '[B, C, bed')],
+)
+def test_another_machine_is_refused(old, new):
+    machine = parse_machine(NMV.replace(old, new, 1))
+    with pytest.raises(UserError, match='does not fit this recording'):
+        identify(machine, cycles(constant))

@@ -25,6 +25,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Protocol
 
 import numpy as np
 
@@ -106,21 +107,35 @@ class Term:
         return value if self.times is None else value * self.times(positions)
 
 
+class Motions(Protocol):
+    """Error motions from elsewhere."""
+
+    @property
+    def axes(self) -> set[str]:
+        """Axes that have any."""
+
+    def of_axis(self, axis: str, positions: Mapping[str, np.ndarray]) -> np.ndarray:
+        """(n, 6) errors A B C X Y Z of one axis [rad] and [m]."""
+
+
 @dataclass(frozen=True)
 class GeometricErrors:
     """All geometric errors of a machine.
 
     constants : location and squareness errors by symbol [m] or [rad]
     terms : position-dependent errors by symbol
+    model : further error motions, of a model file
     """
 
     constants: dict[str, float]
     terms: dict[str, tuple[Term, ...]]
+    model: Motions | None = None
 
     @property
     def axes(self) -> frozenset[str]:
         """Axes that have any error."""
-        return frozenset(split(text).axis for text in (*self.constants, *self.terms))
+        more = self.model.axes if self.model else set()
+        return frozenset(split(text).axis for text in (*self.constants, *self.terms)) | more
 
     def dependent(self, symbol: str, positions: Mapping[str, np.ndarray]) -> np.ndarray:
         """A position-dependent error alone, without the constant [m] or [rad].
@@ -143,6 +158,8 @@ class GeometricErrors:
             if symbol.axis == axis:
                 for term in terms:
                     values[:, symbol.column] += term(positions)
+        if self.model is not None:
+            values += self.model.of_axis(axis, positions)
         return values
 
 

@@ -1,9 +1,15 @@
-"""The truth file: everything the simulated cell is (YAML)."""
+"""The truth file: everything the simulated cell is (YAML).
+
+``python -m rtest_drivers.sim.truth FILE [CYCLE=POSES ...]`` checks a file: exit status 2 and one
+line for a mistake, and a line for each fault that these cycles of a session never meet.
+"""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +18,7 @@ from rtest_drivers.sim.errors import GeometricErrors, parse_errors
 from rtest_drivers.sim.faults import Fault, parse_faults
 from rtest_drivers.sim.fields import Fields, read_yaml
 from rtest_drivers.sim.gauges import GaugeData
+from rtest_drivers.sim.model import load_motions
 from rtest_drivers.sim.motion import Drives
 from rtest_estimation.errors import UserError
 from rtest_identification.machine import Machine, load_machine
@@ -48,7 +55,7 @@ class Truth:
 
 
 def load_truth(path: Path | str) -> Truth:
-    """Read a truth file; `machine` in it is relative to the file.
+    """Read a truth file; `machine` and `model` in it are relative to the file.
 
     Raises UserError naming file, key and what is expected.
     """
@@ -56,9 +63,13 @@ def load_truth(path: Path | str) -> Truth:
     fields = read_yaml(path)
     machine = load_machine(path.parent / str(fields.raw('machine')))
     gauges = _gauges(fields.section('gauges'))
+    errors = parse_errors(fields, machine)
+    model = fields.raw('model', None)
+    if model is not None:
+        errors = replace(errors, model=load_motions(path.parent / str(model), machine))
     truth = Truth(
         machine=machine,
-        errors=parse_errors(fields, machine),
+        errors=errors,
         drives=_drives(fields.section('drives')),
         gauges=gauges,
         encoders=_encoders(fields.section('encoders')),
@@ -135,3 +146,38 @@ def _period(fields: Fields) -> int:
     if rate > 1e6:
         raise UserError(f'{fields.where}: rate_hz: expected at most 1e6, got {rate:g}')
     return round(1e9 / rate)
+
+
+def unmet(faults: Sequence[Fault], cycles: Mapping[str, int]) -> list[str]:
+    """One sentence for each fault that never occurs in these cycles (name to number of poses)."""
+    lines = []
+    for fault in faults:
+        if fault.cycle is None:
+            continue
+        if fault.cycle not in cycles:
+            why = f'no cycle {fault.cycle!r} in this session, which has {", ".join(cycles)}'
+        elif fault.pose is not None and fault.pose >= cycles[fault.cycle]:
+            why = f'no pose {fault.pose} in {fault.cycle}, which has {cycles[fault.cycle]} poses'
+        else:
+            continue
+        lines.append(f'faults: {fault.kind}: {why}: it will not occur')
+    return lines
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Check a truth file; see the module."""
+    path, *cycles = sys.argv[1:] if arguments is None else arguments
+    pairs = (text.rpartition('=') for text in cycles)
+    poses = {name: int(count) for name, _, count in pairs}
+    try:
+        truth = load_truth(path)
+    except UserError as error:
+        print(error, file=sys.stderr)
+        return 2
+    for line in unmet(truth.faults, poses) if poses else ():
+        print(f'{path}: {line}')
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())

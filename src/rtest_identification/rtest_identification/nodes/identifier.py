@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import numpy as np
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
-from rtest_msgs.msg import Cycle, ErrorMap, LocationErrors
+from rtest_msgs.msg import Cycle, ErrorMap, LocationErrors, ModelGap, NestCalibration
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
@@ -15,6 +16,9 @@ from rtest_estimation.nodes.qos import LATCHED, LATCHED_100
 from rtest_estimation.nodes.run import run
 from rtest_estimation.records import Cycle as CycleRecord
 from rtest_estimation.records import Kind
+from rtest_identification.gap.model_file import load_model
+from rtest_identification.gap.offline import gap_session
+from rtest_identification.gap.output import summary
 from rtest_identification.machine import Machine, parse_machine
 from rtest_identification.nodes import publish
 from rtest_identification.pipeline import Identification, identify
@@ -32,7 +36,12 @@ class IdentifierNode(Node):
         self._location = self.create_publisher(LocationErrors, 'rtest/location_errors', LATCHED)
         self._map = self.create_publisher(ErrorMap, 'rtest/error_map', LATCHED_100)
         self._diagnostics = diagnostics.Diagnostics(self)
+        self._gap = self.create_publisher(ModelGap, 'rtest/model_gap', LATCHED)
+        model = self.declare_parameter('model', '').value
+        self._model = load_model(model) if model else None
+        self._directions: dict[str, np.ndarray] = {}
         self.create_subscription(String, 'rtest/machine', self._on_machine, LATCHED)
+        self.create_subscription(NestCalibration, 'rtest/nest', self._on_nest, LATCHED_100)
         self.create_subscription(Cycle, 'rtest/cycle', self._on_cycle, LATCHED_100)
         self.create_service(Trigger, '~/finish', self._on_finish)
         self.create_timer(1.0, self._report, clock=Clock(clock_type=ClockType.STEADY_TIME))
@@ -60,6 +69,10 @@ class IdentifierNode(Node):
         if cycle.plan.kind is Kind.STATIC:
             self._identify()
 
+    def _on_nest(self, message: NestCalibration) -> None:
+        nest = messages.nest_calibration(message)
+        self._directions[nest.calibration] = nest.direction
+
     def _identify(self) -> None:
         if self._machine is None:
             return
@@ -81,7 +94,25 @@ class IdentifierNode(Node):
         self._identify()
         response.success = self._result is not None
         response.message = self._summary()
+        if self._result is not None:
+            response.message += f'; {self._find_gap()}'
         return response
+
+    def _find_gap(self) -> str:
+        """Compare model and measurement, publish what was found, and sum it up."""
+        cycles = tuple(self._cycles.values())
+        directions = {
+            cycle.plan.setup: self._directions[cycle.calibration]
+            for cycle in cycles
+            if cycle.calibration in self._directions
+        }
+        try:
+            found = gap_session(self._machine, cycles, directions, self._model)
+        except UserError as error:
+            return f'no comparison with the model: {error}'
+        stamp = max(cycle.stamp for cycle in cycles)
+        self._gap.publish(publish.model_gap(found, stamp))
+        return summary(found.result)
 
     def _summary(self) -> str:
         if self._result is None:
@@ -89,7 +120,7 @@ class IdentifierNode(Node):
         location = self._result.location
         return (
             f'{int(location.determined.sum())} location and squareness errors from '
-            f'{len(self._result.observations)} poses, residual {self._result.fit.rms * 1e6:.2f} um'
+            f'{len(self._result.observations)} poses, residual {self._result.fit.rms * 1e6:.2f} µm'
         )
 
     def _report(self) -> None:

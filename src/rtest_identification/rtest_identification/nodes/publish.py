@@ -7,6 +7,7 @@ from rtest_msgs import msg
 
 from rtest_estimation.nodes.publish import header
 from rtest_identification.error_map import AxisMap
+from rtest_identification.gap.offline import SessionGap
 from rtest_identification.grid_map import GridMap
 from rtest_identification.pipeline import Identification
 
@@ -52,4 +53,23 @@ def grid_map(result: Identification, grid: GridMap, stamp: int) -> msg.ErrorMap:
         values=grid.value.ravel().tolist(),
         stddev=grid.stddev.ravel().tolist(),
         residual=grid.rms,
+    )
+
+
+def model_gap(found: SessionGap, stamp: int) -> msg.ModelGap:
+    """Verdict, effects and the gap as numbers."""
+    result = found.result
+    gap = result.gap
+    return msg.ModelGap(
+        header=header(stamp, 'machine'),
+        session=found.session,
+        verdict=result.verdict,
+        effects=[f.effect.key for f in result.found],
+        confidence=[f.confidence for f in result.found],
+        rivals=[', '.join(f.rivals) for f in result.found],
+        noise=gap.noise,
+        before=gap.before,
+        after=gap.after,
+        heldout_before=gap.heldout_before,
+        heldout_after=gap.heldout_after,
     )

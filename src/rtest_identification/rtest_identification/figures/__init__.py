@@ -1,0 +1,1 @@
+"""Figures of an identification: a module a kind, one function a figure."""

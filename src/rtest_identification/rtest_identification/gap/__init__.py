@@ -1,0 +1,1 @@
+"""The model gap: where model and measurement disagree, and which effect closes it."""

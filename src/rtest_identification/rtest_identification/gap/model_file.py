@@ -1,0 +1,204 @@
+"""A model is data: which errors are free, which effects it has, their values and where from."""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from rtest_estimation.errors import UserError
+from rtest_identification.gap.effects import Effect, library
+from rtest_identification.gap.scene import Scene
+from rtest_identification.observations import Observations
+
+_KEYS = {'name', 'machine', 'values', 'effects'}
+_EFFECT_KEYS = {'key', 'parameters', 'shape', 'confidence', 'rivals', 'provenance'}
+
+
+@dataclass(frozen=True)
+class Value:
+    """A value with its standard uncertainty, SI; stddev None where it is not known."""
+
+    value: float
+    stddev: float | None
+    unit: str
+
+
+@dataclass(frozen=True)
+class ModelEffect:
+    """An effect that a model has.
+
+    parameters : by name, those the effect is linear in; shape : the others
+    provenance : session, when and why it was added
+    """
+
+    key: str
+    parameters: dict[str, Value]
+    shape: dict[str, Value] = field(default_factory=dict)
+    confidence: float | None = None
+    rivals: tuple[str, ...] = ()
+    provenance: dict[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Model:
+    """Location errors, squareness and effects of a machine.
+
+    machine : name of the machine it was identified on
+    values : identified constants by symbol; what is listed is free when the model is used again
+    """
+
+    name: str
+    machine: str
+    values: dict[str, Value] = field(default_factory=dict)
+    effects: tuple[ModelEffect, ...] = ()
+
+    def resolve(self, library: Sequence[Effect]) -> list[tuple[Effect, tuple[float, ...]]]:
+        """The model's effects with their shape, from a library.
+
+        Raises UserError naming key, parameter and what is expected.
+        """
+        known = {effect.key: effect for effect in library}
+        found = []
+        for entry in self.effects:
+            effect = known.get(entry.key)
+            if effect is None:
+                near = difflib.get_close_matches(entry.key, known, 3)
+                hint = f'; did you mean {", ".join(near)}?' if near else ''
+                raise UserError(
+                    f'model {self.name!r}: no effect {entry.key!r} for this machine{hint}'
+                )
+            names = [p.name for p in effect.shape]
+            if sorted(entry.shape) != sorted(names):
+                raise UserError(
+                    f'model {self.name!r}: {entry.key}: shape has {sorted(entry.shape)}, '
+                    f'expected {sorted(names)}'
+                )
+            found.append((effect, tuple(entry.shape[name].value for name in names)))
+        return found
+
+
+def load_model(path: Path | str) -> Model:
+    """Read a model file.
+
+    Raises UserError naming file, key and what is expected.
+    """
+    try:
+        data = yaml.safe_load(Path(path).read_text(encoding='utf-8'))
+    except (OSError, UnicodeDecodeError) as error:
+        raise UserError(f'{path}: cannot read the model: {error}') from None
+    except yaml.YAMLError as error:
+        raise UserError(f'{path}: not valid YAML: {" ".join(str(error).split())}') from None
+    if not isinstance(data, dict):
+        raise UserError(f'{path}: expected a mapping with name, machine, values and effects')
+    _only(data, _KEYS, str(path))
+    effects = data.get('effects') or []
+    if not isinstance(effects, list):
+        raise UserError(f'{path}: effects: expected a list')
+    return Model(
+        str(data.get('name', Path(path).stem)), str(data.get('machine', '')),
+        _values(data.get('values') or {}, f'{path}: values'),
+        tuple(_effect(entry, f'{path}: effects[{n}]') for n, entry in enumerate(effects)),
+    )
+
+
+def model_columns(
+    model: Model, start: int, directions: Mapping[str, np.ndarray]
+) -> Callable[[Observations, np.ndarray, np.ndarray], np.ndarray]:
+    """The model's effects as columns for `location.fit`.
+
+    start : of the session [ns]; directions : of the gauges by set-up
+    """
+
+    def columns(
+        observations: Observations, jacobian: np.ndarray, fitted: np.ndarray
+    ) -> np.ndarray:
+        scene = Scene(observations, jacobian, fitted, start, directions)
+        chosen = model.resolve(library(scene))
+        empty = np.zeros((len(observations), 3, 0))
+        return np.concatenate([empty, *(e.columns(scene, s) for e, s in chosen)], axis=2)
+
+    return columns
+
+
+def save_model(model: Model, path: Path) -> None:
+    """Write a model file."""
+    data: dict[str, Any] = {
+        'name': model.name,
+        'machine': model.machine,
+        'values': {k: _plain(v) for k, v in model.values.items()},
+        'effects': [
+            {
+                'key': e.key,
+                'parameters': {k: _plain(v) for k, v in e.parameters.items()},
+                **({'shape': {k: _plain(v) for k, v in e.shape.items()}} if e.shape else {}),
+                **({'confidence': e.confidence} if e.confidence is not None else {}),
+                **({'rivals': list(e.rivals)} if e.rivals else {}),
+                **({'provenance': dict(e.provenance)} if e.provenance else {}),
+            }
+            for e in model.effects
+        ],
+    }
+    path.parent.mkdir(parents=True, exist_ok=True)
+    text = yaml.safe_dump(data, sort_keys=False, allow_unicode=True)
+    path.write_text(f'# SI units. Free when used again: the values and the effects.\n{text}')
+
+
+def _plain(value: Value) -> dict[str, Any]:
+    known = value.stddev is not None and math.isfinite(value.stddev)
+    return {
+        'value': float(value.value),
+        **({'stddev': float(value.stddev)} if known else {}),
+        'unit': value.unit,
+    }
+
+
+def _effect(entry: Any, where: str) -> ModelEffect:
+    if not isinstance(entry, dict) or not isinstance(entry.get('key'), str):
+        raise UserError(f'{where}: expected a mapping with a key such as scale/X')
+    _only(entry, _EFFECT_KEYS, where)
+    provenance = entry.get('provenance') or {}
+    if not isinstance(provenance, dict):
+        raise UserError(f'{where}: provenance: expected a mapping')
+    confidence = entry.get('confidence')
+    if confidence is not None and not _number(confidence):
+        raise UserError(f'{where}: confidence: expected a number, got {confidence!r}')
+    return ModelEffect(
+        entry['key'],
+        _values(entry.get('parameters') or {}, f'{where}: parameters'),
+        _values(entry.get('shape') or {}, f'{where}: shape'),
+        confidence, tuple(map(str, entry.get('rivals') or ())),
+        {str(k): str(v) for k, v in provenance.items()},
+    )
+
+
+def _values(data: Any, where: str) -> dict[str, Value]:
+    if not isinstance(data, dict):
+        raise UserError(f'{where}: expected a mapping')
+    values = {}
+    for name, entry in data.items():
+        if not isinstance(entry, dict) or not _number(entry.get('value')):
+            raise UserError(f'{where}: {name}: expected {{value: number, stddev, unit}}')
+        _only(entry, {'value', 'stddev', 'unit'}, f'{where}: {name}')
+        stddev = entry.get('stddev')
+        if stddev is not None and not (_number(stddev) and stddev >= 0):
+            raise UserError(f'{where}: {name}: stddev: expected a number from 0, got {stddev!r}')
+        values[str(name)] = Value(float(entry['value']), stddev, str(entry.get('unit', '')))
+    return values
+
+
+def _number(value: Any) -> bool:
+    good = isinstance(value, int | float) and not isinstance(value, bool)
+    return good and math.isfinite(value)
+
+
+def _only(data: dict, known: set[str], where: str) -> None:
+    for key in data:
+        if key not in known:
+            raise UserError(f'{where}: unknown key {key!r}, expected one of {sorted(known)}')

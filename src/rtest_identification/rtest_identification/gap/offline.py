@@ -1,0 +1,114 @@
+"""The model gap of a recording, without ROS."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import datetime, timezone
+from pathlib import Path
+
+import numpy as np
+
+from rtest_estimation.errors import UserError
+from rtest_estimation.recording import read_recording
+from rtest_estimation.records import Cycle
+from rtest_identification.gap.effects import Effect
+from rtest_identification.gap.model_file import Model, ModelEffect, Value
+from rtest_identification.gap.user_effects import load_effects
+from rtest_identification.gap.workflow import Found, GapResult, analyse
+from rtest_identification.machine import Machine, load_machine, parse_machine
+from rtest_identification.observations import stack
+from rtest_identification.offline import estimate_recording
+
+
+@dataclass(frozen=True)
+class SessionGap:
+    """The gap of one session and the model that closes it as far as it could be closed."""
+
+    session: str
+    result: GapResult
+    model: Model
+    warnings: tuple[str, ...]
+
+
+def gap_recording(
+    path: Path | str,
+    model: Model | None = None,
+    effects_path: Path | str | None = None,
+    machine_path: Path | str | None = None,
+    progress: Callable[[str], None] = lambda line: None,
+) -> SessionGap:
+    """Run the workflow on a recording alone.
+
+    model : what is known of the machine; effects_path : the user's own effects
+    machine_path : another machine file than the recorded one
+
+    Raises UserError naming file and what is expected.
+    """
+    recording = read_recording(path)
+    if machine_path is not None:
+        machine = load_machine(machine_path)
+    elif recording.machine_text is not None:
+        machine = parse_machine(recording.machine_text, f'{path}: /rtest/machine')
+    else:
+        raise UserError(f'{path}: no machine was recorded; give its file with --machine')
+    more = load_effects(effects_path, machine) if effects_path is not None else []
+    finished = estimate_recording(recording, None, progress)
+    directions = {f.nest.setup: f.nest.direction for f in finished if f.nest is not None}
+    progress('comparing model and measurement')
+    session = gap_session(machine, [f.cycle for f in finished], directions, model, more)
+    return SessionGap(session.session, session.result, session.model, recording.warnings)
+
+
+def gap_session(
+    machine: Machine,
+    cycles: Sequence[Cycle],
+    directions: Mapping[str, np.ndarray],
+    model: Model | None = None,
+    more: Sequence[Effect] = (),
+) -> SessionGap:
+    """Run the workflow on the finished cycles of a session: for command and node alike."""
+    cycles = sorted(cycles, key=lambda c: (c.plan.stamp, c.plan.cycle))
+    observations = stack(machine, cycles)
+    start = min(cycle.plan.stamp for cycle in cycles)
+    name = next((c.plan.session for c in cycles if c.plan.session), '')
+    result = analyse(observations, start, directions, model, more)
+    return SessionGap(name, result, extend(model, machine, result, name, start), ())
+
+
+def extend(
+    model: Model | None, machine: Machine, result: GapResult, session: str, start: int
+) -> Model:
+    """The model with what was found, and where that is from."""
+    when = datetime.fromtimestamp(start / 1e9, timezone.utc).isoformat(timespec='seconds')
+    values = {
+        p.symbol: Value(float(v), float(s), p.unit)
+        for p, v, s in zip(
+            result.constants.parameters, result.constants.value, result.constants.stddev,
+            strict=True,
+        )
+    }
+    old = model.effects if model else ()
+    return Model(
+        model.name if model else f'{machine.name or "machine"} after {session}', machine.name,
+        values, (*old, *(_entry(f, result, session, when) for f in result.found)),
+    )
+
+
+def _entry(found: Found, result: GapResult, session: str, when: str) -> ModelEffect:
+    linear, shape = found.effect.parameters, found.effect.shape
+    pairs = [
+        Value(float(v), float(s) if np.isfinite(s) else None, p.unit)
+        for p, v, s in zip((*linear, *shape), found.value, found.stddev, strict=True)
+    ]
+    gap = result.gap
+    why = (
+        f'{found.effect.name}: gap {gap.before * 1e6:.2f} to {gap.after * 1e6:.2f} um, noise '
+        f'{gap.noise * 1e6:.2f} um'
+    )
+    return ModelEffect(
+        found.effect.key,
+        dict(zip([p.name for p in linear], pairs[: len(linear)], strict=True)),
+        dict(zip([p.name for p in shape], pairs[len(linear) :], strict=True)),
+        found.confidence, found.rivals, {'session': session, 'when': when, 'why': why},
+    )

@@ -1,0 +1,101 @@
+"""`gap.json` (schema in the README) of one session."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from pathlib import Path
+from typing import Any
+
+from rtest_identification.gap.workflow import Found, GapResult
+
+
+def as_dict(session: str, result: GapResult, model: str | None = None) -> dict[str, Any]:
+    """The result as JSON data; SI units, numbers unrounded. model : file it was written to."""
+    gap = result.gap
+    return {
+        'session': session,
+        'verdict': result.verdict,
+        'effects': [_effect(found) for found in result.found],
+        'invisible': list(result.invisible),
+        'where': [
+            {'by': place.by, 'value': place.value, 'rms': place.rms, 'p': place.p}
+            for place in result.where
+        ],
+        'gap': {
+            'noise': gap.noise,
+            'before': gap.before,
+            'after': gap.after,
+            'heldout_before': _number(gap.heldout_before),
+            'heldout_after': _number(gap.heldout_after),
+        },
+        'probability': result.probability,
+        'rest_probability': result.rest_probability,
+        'model': model,
+    }
+
+
+def write(session: str, result: GapResult, out: Path, model: str | None = None) -> Path:
+    """Write gap.json into `out`, whole or not at all; returns its path."""
+    out.mkdir(parents=True, exist_ok=True)
+    path = out / 'gap.json'
+    part = path.with_name('gap.json.part')
+    data = as_dict(session, result, model)
+    part.write_text(json.dumps(data, indent=1, allow_nan=False) + '\n', encoding='utf-8')
+    os.replace(part, path)
+    return path
+
+
+def _effect(found: Found) -> dict[str, Any]:
+    names = [p.name for p in (*found.effect.parameters, *found.effect.shape)]
+    units = [p.unit for p in (*found.effect.parameters, *found.effect.shape)]
+    return {
+        'key': found.effect.key,
+        'symbol': ', '.join(found.effect.symbols),
+        'name': found.effect.name,
+        'formula': found.effect.formula,
+        'parameters': dict(zip(names, found.value.tolist(), strict=True)),
+        'stddev': {n: _number(s) for n, s in zip(names, found.stddev.tolist(), strict=True)},
+        'units': dict(zip(names, units, strict=True)),
+        'confidence': found.confidence,
+        'rivals': list(found.rivals),
+        'separate_by': found.separate_by,
+    }
+
+
+def _number(value: float) -> float | None:
+    return float(value) if math.isfinite(value) else None
+
+
+def summary(result: GapResult) -> str:
+    """One line: verdict, effects, gap before and after against the noise."""
+    gap = result.gap
+    names = ' + '.join(found.effect.key for found in result.found)
+    change = f'gap {gap.before * 1e6:.2f} µm'
+    if result.found:
+        change += f' -> {gap.after * 1e6:.2f} µm'
+    return f'{result.verdict}{": " + names if names else ""}, {change}, noise ' \
+           f'{gap.noise * 1e6:.2f} µm'
+
+
+def lines(result: GapResult) -> list[str]:
+    """What a person wants to know of each effect, and where an unexplained gap sits."""
+    told = []
+    for found in result.found:
+        sizes = ', '.join(
+            f'{p.name} = {v:.3g} ± {2 * s:.2g} {p.unit}'
+            for p, v, s in zip(
+                (*found.effect.parameters, *found.effect.shape), found.value, found.stddev,
+                strict=True,
+            )
+        )
+        told.append(f'{found.effect.key}: {found.effect.name}; {found.effect.formula}')
+        told.append(f'  {sizes} (k = 2), confidence {found.confidence:.2f}')
+        if found.rivals:
+            told.append(f'  could also be {", ".join(found.rivals)}')
+            told.append(f'  to tell them apart: {found.separate_by}')
+    if result.verdict in ('unknown effect', 'partly explained'):
+        for place in result.where[:5]:
+            told.append(f'unexplained at {place.by} = {place.value}: rms {place.rms * 1e6:.2f} µm')
+    return told
