@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 from pathlib import Path
 
@@ -12,9 +12,9 @@ import numpy as np
 from rtest_estimation.errors import UserError
 from rtest_estimation.recording import read_recording
 from rtest_estimation.records import Cycle
-from rtest_identification.gap.effects import Effect
+from rtest_identification.gap.effects import Effect, library
 from rtest_identification.gap.model_file import Model, ModelEffect, Value
-from rtest_identification.gap.user_effects import load_effects
+from rtest_identification.gap.user_effects import confusions, load_effects
 from rtest_identification.gap.workflow import Found, GapResult, analyse
 from rtest_identification.machine import Machine, load_machine, parse_machine
 from rtest_identification.observations import stack
@@ -23,12 +23,16 @@ from rtest_identification.offline import estimate_recording
 
 @dataclass(frozen=True)
 class SessionGap:
-    """The gap of one session and the model that closes it as far as it could be closed."""
+    """The gap of one session and the model that closes it as far as it could be closed.
+
+    confusions : which effects of the library the user's own look like in these data
+    """
 
     session: str
     result: GapResult
     model: Model
-    warnings: tuple[str, ...]
+    warnings: tuple[str, ...] = ()
+    confusions: tuple[str, ...] = ()
 
 
 def gap_recording(
@@ -57,7 +61,13 @@ def gap_recording(
     directions = {f.nest.setup: f.nest.direction for f in finished if f.nest is not None}
     progress('comparing model and measurement')
     session = gap_session(machine, [f.cycle for f in finished], directions, model, more)
-    return SessionGap(session.session, session.result, session.model, recording.warnings)
+    alike = []
+    for effect in more:
+        found = confusions(effect, session.result.rows, library(session.result.rows.scene))
+        if found:
+            names = ', '.join(f'{key} ({cosine:.3f})' for key, cosine in found)
+            alike.append(f'{effect.key} looks like {names} in these data (cosine)')
+    return replace(session, warnings=recording.warnings, confusions=tuple(alike))
 
 
 def gap_session(
@@ -73,7 +83,7 @@ def gap_session(
     start = min(cycle.plan.stamp for cycle in cycles)
     name = next((c.plan.session for c in cycles if c.plan.session), '')
     result = analyse(observations, start, directions, model, more)
-    return SessionGap(name, result, extend(model, machine, result, name, start), ())
+    return SessionGap(name, result, extend(model, machine, result, name, start))
 
 
 def extend(

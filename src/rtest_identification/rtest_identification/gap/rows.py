@@ -17,6 +17,8 @@ from rtest_identification.symbols import location_parameters
 
 # Levels of the outer axis are as noisy as each other unless it is this improbable.
 EQUAL_NOISE = 0.01
+# With fewer rows that repeat what others say, the noise is not known well enough by level.
+FEW_REPEATS = 300
 _ITERATIONS = 5
 
 
@@ -121,6 +123,19 @@ def cell_basis(scene: Scene, rows: np.ndarray) -> np.ndarray:
     return u[:, s > 1e-3 * s[0]]
 
 
+def _smooth(scene: Scene) -> np.ndarray:
+    """(n, 3, p): the inner axis's six errors, to twice a turn, at every level of the outer one."""
+    outer, inner = scene.machine.rotary
+    places, level = stations(scene.position(outer))
+    turn = scene.position(inner)
+    waves = [np.ones_like(turn)] + [f(n * turn) for n in (1, 2) for f in (np.cos, np.sin)]
+    columns = [
+        scene.slope(inner, letter) * (wave * (level == k))[:, None]
+        for letter in 'XYZABC' for wave in waves for k in range(len(places))
+    ]
+    return np.stack(columns, axis=2)
+
+
 def _noise(scene: Scene, base: np.ndarray, residual: np.ndarray) -> tuple[np.ndarray, int]:
     """Standard deviation of every row from the richest model, by levels of the outer axis.
 
@@ -144,12 +159,17 @@ def _noise(scene: Scene, base: np.ndarray, residual: np.ndarray) -> tuple[np.nda
     for axis in scene.machine.linear:
         place = scene.position(axis)
         extras += [(scene.slope(axis, c) * place[:, None])[:, :, None] for c in 'ABCXYZ']
-    design = np.concatenate(extras, axis=2).reshape(residual.size, -1)
     y = residual.reshape(-1).copy()
     count = np.full(len(observations), 3.0)
+    poses = [(rows, cell_basis(scene, rows)) for rows in cells(scene)]
+    repeated = residual.size - sum(basis.shape[1] for _, basis in poses)
+    if repeated < FEW_REPEATS:
+        # Too little is seen twice: the rotary axes may do only what is smooth in the inner one.
+        poses = []
+        extras.append(_smooth(scene))
+    design = np.concatenate(extras, axis=2).reshape(residual.size, -1)
     flat = np.arange(residual.size).reshape(-1, 3)
-    for rows in cells(scene):
-        basis = cell_basis(scene, rows)
+    for rows, basis in poses:
         place = flat[rows].reshape(-1)
         design[place] -= basis @ (basis.T @ design[place])
         y[place] -= basis @ (basis.T @ y[place])
@@ -169,7 +189,7 @@ def _noise(scene: Scene, base: np.ndarray, residual: np.ndarray) -> tuple[np.nda
     level = stations(np.abs(scene.position(scene.machine.rotary[0])))[1]
     share = np.bincount(level, count)
     own = np.bincount(level, square) / np.maximum(share, 1e-9)
-    good = share >= 15
+    good = share >= 25
     # Bartlett's test on the variances of the levels.
     statistic = share[good].sum() * np.log(pooled) - (share[good] * np.log(own[good])).sum()
     if good.sum() >= 2 and stats.chi2.sf(statistic, good.sum() - 1) < EQUAL_NOISE:
