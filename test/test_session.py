@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from rtest_drivers.config import config_path
-from rtest_drivers.runner import free_domain
+from rtest_drivers.domain import free_domain
 from rtest_drivers.sim.check import check
 from rtest_estimation.recording import read_recording
 

@@ -10,7 +10,7 @@ from launch_ros.actions import LifecycleNode, Node
 from launch import LaunchContext, LaunchDescription
 from rtest_drivers.config import config_path
 from rtest_drivers.graph import ONE_THREAD, GraphSettings, session_name, session_nodes
-from rtest_identification.plans import load_session
+from rtest_identification.session_file import load_session
 
 ARGUMENTS = {
     'config': (str(config_path('demo.yaml')), 'session file: machine, cycle, set-ups (YAML)'),

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import argparse
+import io
 import os
 import sys
 from collections.abc import Sequence
 from typing import NoReturn
 
-from rtest_drivers.commands import demo, identify, info, session
+from rtest_drivers.commands import demo, gap, identify, info, plan, session
 from rtest_drivers.graph import ONE_THREAD
 from rtest_drivers.runner import NodeFailed, Stopped
 from rtest_estimation.errors import UserError
 
-COMMANDS = (session, demo, identify, info)
+COMMANDS = (session, demo, plan, identify, gap, info)
 EXIT_FAILED, EXIT_USER, EXIT_INTERRUPTED, EXIT_PIPE = 1, 2, 130, 141
 
 
@@ -53,6 +54,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for name, value in ONE_THREAD.items():
         # Before numpy is imported; the nodes inherit it.
         os.environ.setdefault(name, value)
+    _print_on_any_terminal()
     try:
         chosen = parser().parse_args(arguments)
         status = chosen.run(chosen)
@@ -70,6 +72,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # Whoever read the output has read enough; nothing may be written to it any more.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return EXIT_PIPE
+
+
+def _print_on_any_terminal() -> None:
+    """A letter that the terminal does not know is shown as ``?``, here and in what is started."""
+    encoding = os.environ.get('PYTHONIOENCODING', '').partition(':')[0]
+    os.environ['PYTHONIOENCODING'] = f'{encoding}:replace'
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors='replace')
 
 
 def _tell(text: str, status: int) -> int:

@@ -18,6 +18,10 @@ ParameterValue = str | int | float | bool
 LEADER = 'session'
 LAST = 'recorder'
 LOGS = 'log'
+# Exit status of the leader when the recording was closed but something is missing in it.
+INCOMPLETE = 3
+# Simulated seconds per second at which nodes on two processor cores lose nothing.
+RATE = 10.0
 # The problems are small: more threads than one are slower, and not bit for bit repeatable.
 ONE_THREAD = {'OMP_NUM_THREADS': '1', 'OPENBLAS_NUM_THREADS': '1'}
 
@@ -53,7 +57,7 @@ class GraphSettings:
     sphere_radius : of the session file [m]
     out : the recording is written to out/session/session.mcap
     simulate : truth file of the simulated cell; None where real drivers are already in the graph
-    rate : simulated seconds per second of wall time; 0 is as fast as the cell can
+    rate : simulated seconds per second of wall time
     namespace : of every node and topic, empty for none
     remaps : rules ``from:=to`` for every node
     address : where the simulated cell is to be reached by its drivers (AF_UNIX)
@@ -64,7 +68,7 @@ class GraphSettings:
     out: Path
     simulate: Path | None = None
     sphere_radius: float = 0.0127
-    rate: float = 0.0
+    rate: float = 1.0
     namespace: str = ''
     remaps: tuple[str, ...] = ()
     address: str = field(default_factory=lambda: cell_address())
@@ -83,8 +87,11 @@ class GraphSettings:
         for rule in self.remaps:
             if not _REMAP.fullmatch(rule):
                 raise UserError(f'remap {rule!r}: expected FROM:=TO')
-        if not 0.0 <= self.rate < float('inf'):
-            raise UserError(f'rate {self.rate}: expected a number of 0 (no limit) or more')
+        if not 0.0 < self.rate < float('inf'):
+            raise UserError(
+                f'rate {self.rate:g}: expected a number above 0; at {RATE:g} two processor cores '
+                'lose nothing'
+            )
 
     @property
     def folder(self) -> Path:
@@ -103,7 +110,8 @@ class GraphSettings:
 
 
 def session_name(stem: str) -> str:
-    """A name that no earlier session has: stem, date, time."""
+    """A name for a new session: stem, as far as a name may have its letters, date, time."""
+    stem = re.sub(r'[^A-Za-z0-9._-]+', '-', stem).strip('._-') or 'session'
     return f'{stem}-{time.strftime("%Y%m%d-%H%M%S")}'
 
 

@@ -9,12 +9,15 @@ import yaml
 
 from rtest_estimation.bagfile import Bag, read_bag
 from rtest_estimation.errors import UserError
+from rtest_estimation.missing import grouped
+from rtest_estimation.pipeline import Finished
 from rtest_estimation.recording import TYPES, Recording, recording_of
 from rtest_estimation.records import CyclePlan
+from rtest_identification.offline import estimate_recording
 
 
 def describe(path: str | Path) -> list[str]:
-    """Lines that describe a recording: topics, session, plans, losses, warnings.
+    """Lines that describe a recording: topics, session, plans, losses, missing poses, warnings.
 
     Works for any bag; one that cannot be identified from is described with the reason.
 
@@ -27,8 +30,9 @@ def describe(path: str | Path) -> list[str]:
     except UserError as error:
         warnings: tuple[str, ...] = (*bag.warnings, f'not a complete session: {error}')
     else:
-        lines += _session_lines(recording)
-        warnings = recording.warnings
+        finished = estimate_recording(recording)
+        lines += _session_lines(recording) + _missing_lines(finished)
+        warnings = (*recording.warnings, *_problems(finished))
     return lines + _topic_lines(bag) + [f'warning   {warning}' for warning in warnings]
 
 
@@ -49,6 +53,29 @@ def _session_lines(recording: Recording) -> list[str]:
         f'machine   {_machine_name(recording.machine_text)}',
         f'lost      {recording.lost} readings',
         *(f'plan      {_plan(plan)}' for plan in recording.plans),
+    ]
+
+
+def _missing_lines(finished: list[Finished]) -> list[str]:
+    """Poses without a valid point, estimated anew: how many, and which for which reason."""
+    lost = sum(len(item.cycle.missing) for item in finished)
+    poses = sum(len(item.cycle.plan.commands) for item in finished)
+    return [
+        f'missing   {lost} of {poses} poses',
+        *(
+            f'missing   {item.cycle.plan.cycle} {line}'
+            for item in finished
+            for line in grouped(item.cycle.missing)
+        ),
+    ]
+
+
+def _problems(finished: list[Finished]) -> list[str]:
+    """Why cycles could not be evaluated, where that is not the reason of a missing pose."""
+    return [
+        f'{item.cycle.plan.cycle}: {item.problem}'
+        for item in finished
+        if item.problem and item.problem not in {m.reason for m in item.cycle.missing}
     ]
 
 

@@ -8,9 +8,7 @@ is killed.
 from __future__ import annotations
 
 import contextlib
-import os
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -19,13 +17,24 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 
-from rtest_drivers.graph import LAST, LEADER, GraphSettings, ros_arguments, session_nodes
-from rtest_drivers.processes import PATIENCE_S, remove_dead_shared_memory, stop_in_order
+from rtest_drivers.domain import held_domain, session_environment
+from rtest_drivers.graph import (
+    INCOMPLETE,
+    LAST,
+    LEADER,
+    GraphSettings,
+    ros_arguments,
+    session_nodes,
+)
+from rtest_drivers.processes import (
+    PATIENCE_S,
+    remove_dead_shared_memory,
+    remove_leftovers,
+    stop_in_order,
+)
 from rtest_estimation.errors import UserError
 
 LOG_TAIL = 12
-# A domain's ports start at 7400 + 250 x domain; above 101 they meet the system's ephemeral ports.
-_PORT_BASE, _PORT_STEP, _DOMAINS = 7400, 250, 101
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
@@ -55,8 +64,8 @@ class Command:
     shown: bool = False
 
 
-def run_session(settings: GraphSettings, domain: int | None = None) -> None:
-    """Run a session to its end.
+def run_session(settings: GraphSettings, domain: int | None = None) -> bool:
+    """Run a session to its end; returns whether every cycle was measured.
 
     domain : ROS domain; None is the environment's or, for a simulated cell, a free one
 
@@ -68,7 +77,13 @@ def run_session(settings: GraphSettings, domain: int | None = None) -> None:
     ):
         if find_spec(module) is None:
             raise UserError(f'cannot import {module}, which a session needs; {remedy}')
-    environment = session_environment(settings.simulate is not None, domain)
+    remove_leftovers()
+    simulated = settings.simulate is not None
+    with held_domain(simulated, domain, settings.namespace) as number:
+        return _run_graph(settings, session_environment(simulated, number))
+
+
+def _run_graph(settings: GraphSettings, environment: dict[str, str]) -> bool:
     commands = [
         Command(
             node.name,
@@ -81,35 +96,7 @@ def run_session(settings: GraphSettings, domain: int | None = None) -> None:
         )
         for node in session_nodes(settings)
     ]
-    run(commands, environment=environment, leftovers=(settings.address,))
-
-
-def session_environment(simulated: bool, domain: int | None = None) -> dict[str, str]:
-    """Environment of the nodes: a simulated cell stays on this host, in a domain of its own."""
-    environment = dict(os.environ)
-    if domain is not None:
-        environment['ROS_DOMAIN_ID'] = str(domain)
-    if simulated:
-        environment.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
-        if 'ROS_DOMAIN_ID' not in environment:
-            environment['ROS_DOMAIN_ID'] = str(free_domain())
-    environment['PYTHONUNBUFFERED'] = '1'
-    return environment
-
-
-def free_domain() -> int:
-    """A ROS domain (1 to 101) in which no participant runs on this host."""
-    first = os.getpid() % _DOMAINS
-    for step in range(_DOMAINS):
-        domain = 1 + (first + step) % _DOMAINS
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-            try:
-                # Where the first participant of a domain listens.
-                probe.bind(('', _PORT_BASE + _PORT_STEP * domain + 10))
-            except OSError:
-                continue
-        return domain
-    raise UserError('no free ROS domain on this host; choose one with --domain')
+    return run(commands, environment=environment, leftovers=(settings.address,))
 
 
 def run(
@@ -119,11 +106,13 @@ def run(
     environment: dict[str, str] | None = None,
     leftovers: Sequence[str] = (),
     patience: float = PATIENCE_S,
-) -> None:
+) -> bool:
     """Run commands until `leader` ends, then stop the rest, `last` after all others.
 
     patience : see `stop` [s]
     leftovers : files that killed processes may leave; removed at the end
+
+    Returns False where the leader ended with status `INCOMPLETE`.
 
     Raises NodeFailed when one fails, UserError when one reports a user's mistake (status 2),
     Stopped on a signal.
@@ -143,8 +132,7 @@ def run(
             others = [child for name, child in children.items() if name != last]
             rest = [children[last]] if last in children else []
             killed = stop_in_order([others, rest], patience)
-            if killed or any((child.returncode or 0) < 0 for child in children.values()):
-                remove_dead_shared_memory(started - 1.0)
+            remove_dead_shared_memory(started - 1.0)
             for path in leftovers:
                 Path(path).unlink(missing_ok=True)
     if received:
@@ -157,6 +145,7 @@ def run(
     for child in killed:
         name = next(name for name, other in children.items() if other is child)
         raise NodeFailed(f'node {name} did not end and had to be killed; its log: {logs[name]}')
+    return codes[leader] == 0
 
 
 def _watch(
@@ -168,7 +157,7 @@ def _watch(
         for name in sorted(children, key=lambda name: name == leader):
             code = children[name].poll()
             if code is not None:
-                return None if name == leader and code == 0 else name
+                return None if name == leader and code in (0, INCOMPLETE) else name
         time.sleep(0.05)
     return None
 

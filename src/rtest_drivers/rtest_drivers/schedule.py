@@ -17,21 +17,87 @@ SLOW_ROTARY = math.radians(10.0)
 # Settling, block change and waiting for the estimator, per pose and per cycle [s].
 POSE_MARGIN_S = 2.0
 CYCLE_MARGIN_S = 60.0
+# A cycle counts as stopped when no pose was gained for this many of its longest moves, and for
+# this time [s].
+STOPPED_MOVES = 3
+STOPPED_S = 10.0
+# Before the first pose somebody may still be at the machine [s].
+FIRST_S = 60.0
+# The poses are told once a second of wall time, on a busy computer later: what was not heard of
+# for less is no sign [s].
+HEARD_S = 6.0
 
 
 def path_duration(plan: CyclePlan) -> float:
     """Longest time a cycle can reasonably take [s], its axes moving one after the other."""
+    steps = _step_durations(plan)
+    # The way to the first pose: as long as the longest step, or half a turn.
+    approach = max(float(steps.max(initial=0.0)), math.pi / SLOW_ROTARY)
+    poses = len(plan.commands) * (plan.dwell + POSE_MARGIN_S)
+    return float(steps.sum()) + approach + poses + CYCLE_MARGIN_S
+
+
+def pose_patience(plan: CyclePlan) -> float:
+    """Time without another pose after which a cycle that has begun is taken for stopped [s]."""
+    longest = float(_step_durations(plan).max(initial=0.0))
+    return max(STOPPED_S, STOPPED_MOVES * (longest + plan.dwell))
+
+
+def _step_durations(plan: CyclePlan) -> np.ndarray:
+    """(poses - 1,) longest time from each pose to the next, one axis after the other [s]."""
     slow = np.array([SLOW_ROTARY if axis in ROTARY_LETTERS else SLOW_LINEAR for axis in plan.axes])
     if plan.feed > 0.0:
         slow = np.minimum(slow, plan.feed)
-    steps = np.abs(np.diff(plan.commands, axis=0)) / slow
-    # The way to the first pose: as long as the longest step, or half a turn.
-    approach = max(float(steps.sum(axis=1).max(initial=0.0)), math.pi / SLOW_ROTARY)
-    poses = len(plan.commands) * (plan.dwell + POSE_MARGIN_S)
-    return float(steps.sum()) + approach + poses + CYCLE_MARGIN_S
+    return (np.abs(np.diff(plan.commands, axis=0)) / slow).sum(axis=1)
 
 
 def pose_count(poses: int, points: int, missing: int) -> str:
     """For example ``82 of 84 poses, 2 missing``."""
     text = f'{points} of {poses} poses'
     return f'{text}, {missing} missing' if missing else text
+
+
+class Progress:
+    """Watches one cycle: whether the clock goes on, and whether poses are gained.
+
+    stamp : start of the cycle [ns]; wall : the same on the wall clock [s]
+    limit : longest time the cycle may take [s]; 0 is an estimate from its path
+    """
+
+    def __init__(self, plan: CyclePlan, stamp: int, wall: float, limit: float = 0.0) -> None:
+        self._poses = len(plan.commands)
+        self._stamp = stamp
+        self._limit = limit or path_duration(plan)
+        self._patience = pose_patience(plan)
+        self._done = 0
+        self._gained = self._clock = (stamp, wall)
+
+    def clock_stands(self, now: int, wall: float) -> float:
+        """How long the time `now` [ns] has been the same, on the wall clock [s]."""
+        if now != self._clock[0]:
+            self._clock = (now, wall)
+        return wall - self._clock[1]
+
+    def stopped(self, now: int, wall: float, done: int, feedback_age: float | None) -> str:
+        """Why the cycle has stopped, '' while it goes on.
+
+        Parameters
+        ----------
+        now, wall : time of the session [ns] and of the wall clock [s]
+        done : poses that were reached by now
+        feedback_age : of the newest encoder feedback [s]; infinite where there is none, None where
+            nothing was heard of it
+        """
+        if done > self._done:
+            self._done, self._gained = done, (now, wall)
+        poses = f'{self._done} of {self._poses} poses'
+        waited = (now - self._gained[0]) / NANOSECONDS
+        patience = self._patience if self._done else max(self._patience, FIRST_S)
+        stale = feedback_age is not None and feedback_age > patience
+        begun = 0 < self._done < self._poses
+        if waited > patience and wall - self._gained[1] > HEARD_S and (stale or begun):
+            what = 'encoder feedback' if stale else 'other pose'
+            return f'{poses}, no {what} for {min(feedback_age, waited) if stale else waited:.0f} s'
+        if (now - self._stamp) / NANOSECONDS > self._limit:
+            return f'{poses}, not finished after {self._limit:.0f} s'
+        return ''

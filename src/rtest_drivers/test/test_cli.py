@@ -27,10 +27,10 @@ def run(capsys, *arguments: str) -> tuple[int, str, str]:
 def test_help_names_every_command(capsys):
     status, out, err = run(capsys, '--help')
     assert status == 0 and not err
-    assert all(f'    {name} ' in out for name in ('session', 'demo', 'identify', 'info'))
+    assert all(f'    {name} ' in out for name in ('session', 'demo', 'plan', 'identify', 'info'))
 
 
-@pytest.mark.parametrize('command', ['session', 'demo', 'identify', 'info'])
+@pytest.mark.parametrize('command', ['session', 'demo', 'plan', 'identify', 'info'])
 def test_every_command_explains_itself(capsys, command):
     status, out, _ = run(capsys, command, '--help')
     assert status == 0 and len(out.splitlines()) > 5
@@ -132,7 +132,7 @@ def test_configuration_is_found_in_sources_and_where_it_is_installed(tmp_path, m
 
 def test_the_demo_measures_the_cycle_of_the_thesis():
     from rtest_estimation.records import Kind
-    from rtest_identification.plans import load_session
+    from rtest_identification.session_file import load_session
 
     config = load_session(config_path('demo.yaml'))
     static = [plan for plan in config.plans if plan.kind is Kind.STATIC]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fcntl
+import mmap
 import os
 import signal
 import socket
@@ -13,9 +14,16 @@ from pathlib import Path
 
 import pytest
 
-from rtest_drivers.graph import GraphSettings, ros_arguments, session_nodes
-from rtest_drivers.processes import remove_dead_shared_memory, stop
-from rtest_drivers.runner import Command, NodeFailed, free_domain, run
+from rtest_drivers.domain import chosen_domain, free_domain, held_domain, session_environment
+from rtest_drivers.graph import (
+    INCOMPLETE,
+    GraphSettings,
+    ros_arguments,
+    session_name,
+    session_nodes,
+)
+from rtest_drivers.processes import remove_dead_shared_memory, remove_dead_sockets, stop
+from rtest_drivers.runner import Command, NodeFailed, run
 from rtest_estimation.errors import UserError
 
 # Says that it is there, and when it was asked to stop.
@@ -212,6 +220,40 @@ def test_only_dead_shared_memory_of_this_run_is_removed(tmp_path):
     assert (tmp_path / 'fastrtps_old').exists() and (tmp_path / 'fastrtps_shared').exists()
 
 
+def test_dead_ports_are_removed_too(tmp_path):
+    """A port keeps its segment and mutex when a writer of it was killed."""
+    dead = {'fastrtps_port7413', 'fastrtps_port7415', 'fastrtps_port7415_el'}
+    alive = {'fastrtps_port7417', 'fastrtps_port7417_sl'}
+    for name in dead | alive:
+        (tmp_path / name).touch()
+    dead |= {'sem.fastrtps_port7413_mutex', 'sem.fastrtps_port7499_mutex'}
+    alive |= {'sem.fastrtps_port7417_mutex', 'other'}
+    for name in dead | alive:
+        (tmp_path / name).touch()
+    mapped = tmp_path / 'fastrtps_port7421'
+    mapped.write_bytes(bytes(4096))
+    with (tmp_path / 'fastrtps_port7417_sl').open() as shared, mapped.open('r+b') as file:
+        fcntl.flock(shared, fcntl.LOCK_SH)
+        with mmap.mmap(file.fileno(), 4096):
+            removed = remove_dead_shared_memory(0.0, tmp_path, until=time.time() - 60.0)
+            assert not removed, 'too young'
+            removed = remove_dead_shared_memory(0.0, tmp_path)
+    assert set(removed) == dead
+    assert {path.name for path in tmp_path.iterdir()} == alive | {mapped.name}
+
+
+def test_the_socket_of_a_dead_cell_is_removed(tmp_path):
+    paths = [tmp_path / f'rtest-cell-{name}.sock' for name in ('dead', 'alive', 'file')]
+    with socket.socket(socket.AF_UNIX) as dead, socket.socket(socket.AF_UNIX) as alive:
+        dead.bind(str(paths[0]))
+        alive.bind(str(paths[1]))
+        alive.listen()
+        dead.close()
+        paths[2].touch()
+        assert remove_dead_sockets(tmp_path) == ['rtest-cell-dead.sock']
+    assert paths[1].exists() and paths[2].exists()
+
+
 def test_free_domain_avoids_a_domain_in_use():
     first = free_domain()
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as participant:
@@ -222,7 +264,7 @@ def test_free_domain_avoids_a_domain_in_use():
 def test_names_that_would_break_ros_arguments_are_refused(tmp_path):
     for wrong in (
         {'session': 'a/b'}, {'namespace': 'my cell'}, {'remaps': ('rtest/plan=plan',)},
-        {'rate': -1.0},
+        {'rate': -1.0}, {'rate': 0.0}, {'rate': float('nan')},
     ):
         with pytest.raises(UserError):
             GraphSettings(**{'config': tmp_path, 'session': 'a', 'out': tmp_path, **wrong})
@@ -245,3 +287,53 @@ def test_without_a_simulated_cell_the_drivers_are_somebody_elses(tmp_path):
     nodes = session_nodes(GraphSettings(tmp_path / 'a.yaml', 'a', tmp_path))
     assert [n.name for n in nodes] == ['recorder', 'estimator', 'identifier', 'session']
     assert not any(n.parameters.get('use_sim_time') for n in nodes)
+
+
+def test_a_simulated_session_ignores_the_domain_and_range_of_the_environment(monkeypatch):
+    monkeypatch.setenv('ROS_DOMAIN_ID', '42')
+    monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'SUBNET')
+    monkeypatch.setenv('ROS_STATIC_PEERS', '10.0.0.1')
+    with held_domain(True, None) as domain, held_domain(True, None) as other:
+        assert 42 not in (domain, other) and domain != other
+    environment = session_environment(True, domain)
+    assert environment['ROS_DOMAIN_ID'] == str(domain)
+    assert environment['ROS_AUTOMATIC_DISCOVERY_RANGE'] == 'LOCALHOST'
+    assert 'ROS_STATIC_PEERS' not in environment
+    # A real machine is where the user's environment says.
+    assert chosen_domain(False, None) == 42 and chosen_domain(True, 7) == 7
+    assert session_environment(False, 42)['ROS_AUTOMATIC_DISCOVERY_RANGE'] == 'SUBNET'
+
+
+def test_a_second_session_in_a_domain_is_refused():
+    domain = free_domain()
+    with held_domain(True, domain):
+        assert free_domain() != domain
+        with pytest.raises(UserError, match=f'a session runs in ROS domain {domain} already'), (
+            held_domain(True, domain)
+        ):
+            pass
+    with held_domain(False, domain, 'cell_1'), held_domain(False, domain, '/cell_2'):
+        pass
+
+
+@pytest.mark.parametrize('text', ['abc', '-1', '233', '1.5', '²'])
+def test_a_domain_that_is_none_is_refused(monkeypatch, text):
+    monkeypatch.setenv('ROS_DOMAIN_ID', text)
+    with pytest.raises(UserError, match=f'ROS_DOMAIN_ID={text}: expected a number from 0 to 232'):
+        chosen_domain(False, None)
+    monkeypatch.setenv('ROS_DOMAIN_ID', '')
+    assert chosen_domain(False, None) == 0 and chosen_domain(True, None) is None
+
+
+def test_an_incomplete_session_is_no_failed_node(tmp_path):
+    leader = f'import sys, time; time.sleep(0.5); sys.exit({INCOMPLETE})'
+    for code, complete in ((leader, False), ('import time; time.sleep(0.5)', True)):
+        commands = [command(tmp_path, 'recorder', NODE), command(tmp_path, 'session', code)]
+        assert run(commands) is complete
+
+
+def test_a_default_name_is_one_that_is_allowed(tmp_path):
+    for stem in ('sp äö (2)', 'a/b', '..', 'ü', 'größe.v2'):
+        name = session_name(stem)
+        assert GraphSettings(tmp_path, name, tmp_path).session == name
+    assert session_name('monday').startswith('monday-2')

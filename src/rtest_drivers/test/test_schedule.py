@@ -7,7 +7,17 @@ import math
 import numpy as np
 import pytest
 
-from rtest_drivers.schedule import CYCLE_MARGIN_S, POSE_MARGIN_S, path_duration, pose_count
+from rtest_drivers.schedule import (
+    CYCLE_MARGIN_S,
+    FIRST_S,
+    HEARD_S,
+    POSE_MARGIN_S,
+    STOPPED_S,
+    Progress,
+    path_duration,
+    pose_count,
+    pose_patience,
+)
 from rtest_estimation.records import CyclePlan, Kind
 
 
@@ -32,3 +42,43 @@ def test_a_slow_feed_takes_longer():
 def test_missing_poses_are_told_only_where_there_are_some():
     assert pose_count(84, 84, 0) == '84 of 84 poses'
     assert pose_count(84, 82, 2) == '82 of 84 poses, 2 missing'
+
+
+# The longest move is 2 s, or with the dwell 2.5 s.
+THREE = [[0.0, 0.0], [0.1, 0.0], [0.15, 0.0]]
+SECOND = 1_000_000_000
+
+
+def test_patience_is_that_of_the_longest_move():
+    assert pose_patience(plan(THREE)) == STOPPED_S
+    assert pose_patience(plan([[0.0, 0.0], [1.0, math.pi]])) == pytest.approx(3 * (20 + 18 + 0.5))
+
+
+def test_a_cycle_that_gains_no_pose_has_stopped():
+    progress = Progress(plan(THREE), 0, 100.0)
+    for number in range(12):
+        assert not progress.stopped(number * SECOND, 100.0 + number, min(number, 2), 0.02)
+    wall = 102.0 + HEARD_S
+    assert not progress.stopped(30 * SECOND, wall - 0.1, 2, 0.02), 'nothing was heard since'
+    why = progress.stopped(30 * SECOND, wall + 0.1, 2, 0.02)
+    assert why == '2 of 3 poses, no other pose for 28 s'
+    assert not progress.stopped(31 * SECOND, wall + 1.0, 3, 0.02), 'it has gone on'
+    assert not progress.stopped(80 * SECOND, wall + 60.0, 3, 0.02), 'the gauges are waited for'
+
+
+def test_a_cycle_without_feedback_has_stopped_even_before_its_first_pose():
+    progress = Progress(plan(THREE), 0, 0.0)
+    late = int((FIRST_S + 5) * SECOND)
+    assert not progress.stopped(late, 60.0, 0, 0.02), 'somebody is still at the machine'
+    assert not progress.stopped(late, 60.0, 0, None)
+    why = progress.stopped(late, 60.0, 0, FIRST_S + 1)
+    assert why == '0 of 3 poses, no encoder feedback for 61 s'
+    assert 'no encoder feedback for 65 s' in progress.stopped(late, 60.0, 0, math.inf)
+    assert 'not finished after' in progress.stopped(1000 * SECOND, 60.0, 0, 0.02)
+
+
+def test_a_clock_that_stands_is_seen():
+    progress = Progress(plan(THREE), 0, 0.0)
+    assert progress.clock_stands(1, 5.0) == 0.0
+    assert progress.clock_stands(1, 9.0) == 4.0
+    assert progress.clock_stands(2, 10.0) == 0.0

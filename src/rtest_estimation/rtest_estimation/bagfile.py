@@ -6,6 +6,7 @@ Whatever can be read is; the rest is counted and named in `Bag.warnings`. MCAP f
 
 from __future__ import annotations
 
+import sqlite3
 from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field
@@ -87,6 +88,8 @@ def read_bag(path: str | Path, keep: Collection[str]) -> Bag:
     path = Path(path)
     if not path.exists():
         raise UserError(f'{path}: no such file or directory; expected a recording')
+    if not path.is_file() and not path.is_dir():
+        raise UserError(f'{path}: neither a file nor a directory; expected a recording')
     contents = _Contents(keep)
     try:
         files, storage = _find_files(path, contents)
@@ -98,10 +101,11 @@ def read_bag(path: str | Path, keep: Collection[str]) -> Bag:
                 contents.closed &= scan.closed
                 contents.warnings += scan.warnings
         else:
-            _scan_other(files[0].parent, contents)
+            _scan_other(files[0], contents)
         size = sum(file.stat().st_size for file in files)
-    except PermissionError as error:
-        raise UserError(f'{error.filename}: no permission to read it') from error
+    except OSError as error:
+        where = error.filename or path
+        raise UserError(f'{where}: cannot be read: {error.strerror or error}') from error
     return Bag(
         path,
         files,
@@ -127,12 +131,30 @@ def _find_files(path: Path, contents: _Contents) -> tuple[tuple[Path, ...], str]
         contents.warnings.append(f'{path}/metadata.yaml names {missing[0]}, which is not there')
     files = [path / name for name in listed if name not in missing]
     # metadata.yaml can be provisional, gone, or of a bag that was renamed.
-    files = files or sorted(path.glob('*.mcap')) or sorted(path.glob('*.db3'))
+    files = files or _unlisted_files(path)
     if not files:
         inside = sorted(entry.parent.name for entry in path.glob('*/*.mcap'))
         hint = f'; name one of its recordings: {", ".join(inside[:5])}' if inside else ''
-        raise UserError(f'{path}: no .mcap file in this directory{hint}')
+        raise UserError(f'{path}: no recording in this directory{hint}')
     return tuple(files), 'mcap' if all(file.suffix == '.mcap' for file in files) else 'other'
+
+
+def _unlisted_files(folder: Path) -> list[Path]:
+    """Files of the one recording in a folder without metadata.yaml, in order.
+
+    Raises UserError where there are several recordings.
+    """
+    found = sorted(p for p in folder.iterdir() if p.suffix in ('.mcap', '.db3') and p.is_file())
+    if len(found) < 2:
+        return found
+    # One recording that rosbag2 has split is NAME_0, NAME_1 and so on.
+    for first in found:
+        stem = first.stem.removesuffix('_0')
+        parts = [folder / f'{stem}_{number}{first.suffix}' for number in range(len(found))]
+        if set(parts) == set(found):
+            return parts
+    names = ', '.join(file.name for file in found[:5])
+    raise UserError(f'{folder}: {len(found)} recordings in one directory: {names}; name one')
 
 
 def _listed_files(folder: Path) -> list[str]:
@@ -146,8 +168,14 @@ def _listed_files(folder: Path) -> list[str]:
         return []
 
 
-def _scan_other(folder: Path, contents: _Contents) -> None:
-    """Read a bag directory of another storage."""
+def _scan_other(file: Path, contents: _Contents) -> None:
+    """Read the bag directory of a file of another storage."""
+    folder = file.parent
+    if not (folder / 'metadata.yaml').is_file():
+        raise UserError(
+            f'{file}: there is no metadata.yaml beside it, which this kind of recording needs; '
+            'make it with `ros2 bag reindex`'
+        )
     forms = {MessageDefinitionFormat.MSG: 'ros2msg', MessageDefinitionFormat.IDL: 'ros2idl'}
     try:
         with Reader(folder) as reader:
@@ -162,5 +190,5 @@ def _scan_other(folder: Path, contents: _Contents) -> None:
             for connection, log_time, data in reader.messages():
                 definition = definitions[connection.topic, connection.id]
                 contents.add(connection.topic, definition, log_time, bytes(data))
-    except (ReaderError, FileNotFoundError) as error:
+    except (ReaderError, FileNotFoundError, sqlite3.Error) as error:
         raise UserError(f'{folder}: cannot be read as a recording: {error}') from error

@@ -57,6 +57,7 @@ def find_dwells(
     stamps: np.ndarray,
     positions: np.ndarray,
     rules: DwellRules | None = None,
+    until: int | None = None,
 ) -> tuple[list[Dwell], list[Missing]]:
     """Match the stretches in which every axis stood still to the poses of the plan, in order.
 
@@ -67,6 +68,7 @@ def find_dwells(
     ----------
     stamps : (n,) int64, strictly increasing [ns]
     positions : (n, axes) in the order of ``plan.axes``; NaN where the feedback has no such axis
+    until : when the cycle ended [ns]; the last feedback where it is not known
 
     Returns
     -------
@@ -88,10 +90,11 @@ def find_dwells(
     runs = _standing(stamps, positions, still, gaps, lag)
     matched = _match(plan.commands, positions, runs, near)
     dwells, missing = [], []
+    ends = np.append(stamps, stamps[-1] if until is None else max(until, int(stamps[-1])))
     planned = round(plan.dwell * 1e9)
     for row in range(count):
         if row not in matched:
-            missing.append(Missing(row, _why_absent(row, matched, runs, stamps, gaps)))
+            missing.append(Missing(row, _why_absent(row, matched, runs, ends, gaps)))
             continue
         number, place = matched[row]
         first, last = runs[number]

@@ -75,6 +75,11 @@ class Estimator:
         return self._plans[0] if self._plans else None
 
     @property
+    def feedback_stamp(self) -> int:
+        """Stamp of the newest encoder feedback [ns]; 0 before the first."""
+        return self._feedback.last
+
+    @property
     def nest(self) -> NestCalibration | None:
         """Calibration of the set-up that is measured, or else the newest."""
         plan = self.current
@@ -124,7 +129,7 @@ class Estimator:
             if ready is None:
                 plan = self._plans[0]
                 limit = self._plans[1].stamp if len(self._plans) > 1 else None
-                last = max(self._feedback.last, plan.stamp)
+                last = max(self._feedback.last, self._gauges.last, plan.stamp)
                 ready = self._close(plan, last if limit is None else limit)
             done.append(ready)
         return done
@@ -148,7 +153,7 @@ class Estimator:
             reason = 'dynamic cycles are recorded but not evaluated'
             missing = tuple(Missing(row, reason) for row in range(len(plan.commands)))
             return Finished(Cycle(plan, (), missing, '', end), problem=reason)
-        dwells, missing = find_dwells(plan, stamps, positions, self.rules.dwell)
+        dwells, missing = find_dwells(plan, stamps, positions, self.rules.dwell, end)
         data = (times, displacement, status)
         if plan.kind is Kind.NEST_CALIBRATION:
             return self._calibrate(plan, dwells, missing, data, end)
@@ -213,7 +218,7 @@ def _mean(
     mean = average(displacement[used], status[used], needed)
     scatter = float(np.sqrt(np.trace(mean.covariance) * mean.readings / len(mean.gauges)))
     if scatter > MAX_SCATTER:
-        raise NoAverageError(f'readings scatter {scatter * 1e6:.0f} um: vibration or not settled')
+        raise NoAverageError(f'readings scatter {scatter * 1e6:.0f} µm: vibration or not settled')
     return mean
 
 

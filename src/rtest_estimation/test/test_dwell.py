@@ -116,6 +116,16 @@ def test_stale_feedback_is_said():
     assert {3, 4} <= {d.index for d in dwells}
 
 
+def test_feedback_that_never_comes_back_is_stale_not_unreached():
+    stamps, positions = feedback(ROUND)
+    keep = stamps < T0 + 1_000_000_000
+    _, missing = find_dwells(plan(ROUND), stamps[keep], positions[keep], None, T0 + 9_000_000_000)
+    assert [m.index for m in missing] == [2, 3, 4]
+    assert all('stale for 8.0' in m.reason for m in missing)
+    _, missing = find_dwells(plan(ROUND), stamps[keep], positions[keep])
+    assert {m.reason for m in missing} == {'never reached'}
+
+
 def test_feedback_lost_during_a_stop_does_not_shift_the_poses():
     stamps, positions = feedback(ROUND, dwell=1.0)
     keep = (stamps < T0 + 1_400_000_000) | (stamps > T0 + 1_700_000_000)

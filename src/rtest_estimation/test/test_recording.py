@@ -429,7 +429,7 @@ def test_bag_written_by_rosbags(tmp_path, plugin):
 def test_what_is_not_a_recording(tmp_path):
     with pytest.raises(UserError, match='no such file'):
         read_recording(tmp_path / 'nothing')
-    with pytest.raises(UserError, match=r'no \.mcap file'):
+    with pytest.raises(UserError, match='no recording in this directory'):
         read_recording(tmp_path)
     text = tmp_path / 'notes.mcap'
     text.write_text('not a recording, but longer than the magic of one')
@@ -439,8 +439,12 @@ def test_what_is_not_a_recording(tmp_path):
     with pytest.raises(UserError, match='not an MCAP file'):
         read_recording(text)
     sqlite3.connect(tmp_path / 'bag.db3').close()
+    with pytest.raises(UserError, match='needs'):
+        read_recording(tmp_path / 'bag.db3')
+    (tmp_path / 'metadata.yaml').write_text('[1, 2]')
     with pytest.raises(UserError, match='cannot be read'):
         read_recording(tmp_path / 'bag.db3')
+    (tmp_path / 'metadata.yaml').unlink()
     make_session(tmp_path / 'out' / 'monday' / 'monday.mcap')
     with pytest.raises(UserError, match='name one of its recordings: monday'):
         read_recording(tmp_path / 'out')
@@ -476,3 +480,36 @@ def test_the_maker_of_these_files_makes_many_chunks(tmp_path):
     with bag.path.open('rb') as file:
         records = list(StreamReader(file, emit_chunks=True).records)
     assert sum(type(record).__name__ == 'Chunk' for record in records) == 10
+
+
+def test_two_recordings_in_one_directory_are_refused(tmp_path):
+    for name in ('monday.mcap', 'tuesday.mcap'):
+        bag = BagMaker(tmp_path / name)
+        bag.add('/rtest/gauges', gauges(0))
+        bag.close()
+    with pytest.raises(UserError, match=r'2 recordings .*monday\.mcap, tuesday\.mcap'):
+        read_recording(tmp_path)
+
+
+def test_parts_of_a_split_bag_may_be_listed(tmp_path):
+    """Whatever their names, where metadata.yaml says that they belong together."""
+    for number, name in enumerate(('b.mcap', 'a.mcap')):
+        bag = BagMaker(tmp_path / name)
+        bag.add('/rtest/plan', plan())
+        bag.add('/rtest/cnc/feedback', feedback(START))
+        bag.add('/rtest/gauges', gauges(10 * number))
+        bag.close()
+    listed = {'rosbag2_bagfile_information': {'relative_file_paths': ['b.mcap', 'a.mcap']}}
+    (tmp_path / 'metadata.yaml').write_text(yaml.safe_dump(listed))
+    assert [block.sequence for block in read_recording(tmp_path).gauges] == [0, 10]
+
+
+def test_what_is_no_recording_at_all(tmp_path):
+    with pytest.raises(UserError, match='neither a file nor a directory'):
+        read_recording('/dev/null')
+    (tmp_path / 'x.mcap').mkdir()
+    with pytest.raises(UserError, match='no recording in this directory'):
+        read_recording(tmp_path)
+    (tmp_path / 'bare.db3').touch()
+    with pytest.raises(UserError, match=r'bare\.db3: .*metadata\.yaml'):
+        read_recording(tmp_path / 'bare.db3')

@@ -10,7 +10,7 @@ import argparse
 import subprocess
 import sys
 
-from rtest_drivers.commands.session import add_run_arguments, measure, shown
+from rtest_drivers.commands.session import add_run_arguments, evaluate, measure, shown
 from rtest_drivers.config import config_path
 from rtest_drivers.graph import GraphSettings, session_name
 
@@ -24,8 +24,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Session, identification, comparison; 1 where a value is not within its uncertainty."""
-    from rtest_drivers.commands.identify import identify
-
     truth = config_path('cell_demo.yaml')
     settings = GraphSettings(
         config=config_path('demo.yaml'),
@@ -34,8 +32,8 @@ def run(arguments: argparse.Namespace) -> int:
         simulate=truth,
         rate=arguments.rate,
     )
-    measure(settings, arguments.domain)
-    result = identify(settings.folder)
+    settings, complete = measure(settings, arguments.domain)
+    result = evaluate(settings, complete)
     # In a process of its own: the truth is known to nothing that estimates.
     check = [sys.executable, '-m', 'rtest_drivers.sim.check', str(truth), str(result)]
     status = subprocess.run(check, check=False).returncode

@@ -55,6 +55,8 @@ def _one(bag: Path, model: object, arguments: argparse.Namespace, out: Path) -> 
     )
     for warning in found.warnings:
         print(f'  warning: {warning}')
+    for line in found.confusions:
+        print(f'  {line}')
     save_model(found.model, out / 'model.yaml')
     path = output.write(found.session, found.result, out, 'model.yaml')
     if not arguments.no_report:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import os
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -26,6 +27,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('bags', type=Path, nargs='+', metavar='BAG', help='recorded session')
     parser.add_argument('--machine', type=Path, metavar='FILE',
                         help='machine file to use instead of the recorded one')
+    parser.add_argument('--tolerance', type=Path, metavar='FILE',
+                        help='judge every error by the limits of FILE: pass, fail or undecided '
+                        '(ISO 14253-1); for example config/tolerance_example.yaml')
+    parser.add_argument('--priors', type=Path, metavar='FILE',
+                        help='error motions of the linear axes as far as they are known, for the '
+                        'uncertainty; for example config/priors_example.yaml')
+    parser.add_argument('--monte-carlo', type=int, default=0, metavar='N', dest='trials',
+                        help='check the uncertainty of the location errors by N random trials')
+    parser.add_argument('--model', type=Path, metavar='FILE',
+                        help='a model.yaml of `rtest gap`, whose effects are taken out')
     parser.add_argument('--out', type=Path, metavar='DIR',
                         help='write to DIR, or to DIR/NAME of each of several recordings')
     parser.add_argument('--topic', action='append', default=[], metavar='ROLE=NAME',
@@ -38,7 +49,11 @@ def run(arguments: argparse.Namespace) -> int:
     several = len(arguments.bags) > 1
     for bag in arguments.bags:
         out = arguments.out / recording_name(bag) if arguments.out and several else arguments.out
-        identify(bag, arguments.machine, out, _topics(arguments.topic))
+        options = Options(
+            arguments.machine, _topics(arguments.topic), arguments.tolerance, arguments.priors,
+            arguments.model, arguments.trials,
+        )
+        identify(bag, out, options)
     return 0
 
 
@@ -54,29 +69,79 @@ def _topics(chosen: list[str]) -> dict[str, str]:
     return topics
 
 
+@dataclass(frozen=True)
+class Options:
+    """How to identify: other files than the recorded ones, and what to do besides.
+
+    trials : of a Monte Carlo propagation; 0 for none
+    """
+
+    machine: Path | None = None
+    topics: dict[str, str] | None = None
+    tolerance: Path | None = None
+    priors: Path | None = None
+    model: Path | None = None
+    trials: int = 0
+
+
 def identify(
-    bag: Path,
-    machine: Path | None = None,
-    out: Path | None = None,
-    topics: dict[str, str] | None = None,
+    bag: Path, out: Path | None = None, options: Options | None = None, quiet: bool = False
 ) -> Path:
     """Identify one recording, with progress and a last line that says what was found.
 
+    quiet : without what a session has said of its cycles already
+
     Returns the path of identification.json.
     """
+    options = options or Options()
     from rtest_drivers.commands.session import shown
+    from rtest_drivers.folders import check_folder, writing
     from rtest_identification import output
     from rtest_identification.offline import identify_recording
+    from rtest_identification.tolerance import load_tolerances
+    from rtest_identification.verdict import judge
+    from rtest_identification.verdict_table import lines
 
+    limits = load_tolerances(options.tolerance) if options.tolerance else None
+    if out is not None:
+        check_folder(out)
     name = recording_name(bag)
     result = identify_recording(
-        bag, machine, lambda line: print(f'  {line}', flush=True), topics
+        bag, options.machine, lambda line: quiet or print(f'  {line}', flush=True),
+        options.topics, options.priors, options.model,
     )
+    for line in _missing(result):
+        print(f'  missing: {line}')
     for warning in result.warnings:
         print(f'  warning: {warning}')
-    path = output.write(result, out or default_output(bag))['json']
-    print(f'{name}: {_found(result)} -> {shown(path.absolute())}', flush=True)
+    for line in _trials(result, options.trials):
+        print(f'  {line}')
+    verdict = judge(result, limits) if limits else None
+    for line in lines(verdict) if verdict else ():
+        print(f'  {line}')
+    folder = out or default_output(bag)
+    with writing(folder):
+        path = output.write(result, folder, verdict)['json']
+    judged = f', verdict: {verdict.summary}' if verdict else ''
+    print(f'{name}: {_found(result)}{judged} -> {shown(path.absolute())}', flush=True)
     return path
+
+
+def _trials(result: Identification, trials: int) -> list[str]:
+    """Monte Carlo beside linear propagation, standard uncertainties in µm and µrad."""
+    if trials <= 0:
+        return []
+    from rtest_identification.uncertainty import NOISE, monte_carlo
+
+    scatter = replace(result.location, covariance=result.budget.parts[NOISE])
+    draws = monte_carlo(scatter, result.sources, result.fit.rms, max(trials, 100))
+    found = draws.covariance.diagonal() ** 0.5
+    return [f'{trials} trials: standard uncertainty by Monte Carlo / linear propagation'] + [
+        f'  {p.symbol:10} {1e6 * one:8.3f} /{1e6 * other:8.3f} {"µrad" if p.angular else "µm"}'
+        for p, one, other in zip(
+            result.location.parameters, found, result.location.stddev, strict=True
+        )
+    ]
 
 
 def _found(result: Identification) -> str:
@@ -86,13 +151,26 @@ def _found(result: Identification) -> str:
     location = sum(turns and good for turns, good in zip(rotary, determined, strict=True))
     square = sum(determined) - location
     used = len(result.observations) - len(result.outliers)
-    static = set(result.observations.cycles)
-    lost = sum(item.cycle in static for item in result.missing)
     return (
         f'{location} location errors, {square} squareness errors, '
         f'residual {result.fit.rms * 1e6:.2f} µm, '
-        f'{used} of {len(result.observations) + lost} poses'
+        f'{used} of {result.poses} poses'
     )
+
+
+def _missing(result: Identification) -> list[str]:
+    """Missing poses by cycle and reason, for example `1a-static 3-17: no gauge readings`."""
+    from rtest_estimation.missing import grouped
+    from rtest_estimation.records import Missing
+
+    cycles = dict.fromkeys(item.cycle for item in result.missing)
+    return [
+        f'{cycle} {line}'
+        for cycle in cycles
+        for line in grouped(
+            Missing(item.pose, item.reason) for item in result.missing if item.cycle == cycle
+        )
+    ]
 
 
 def recording_name(bag: Path) -> str:
@@ -101,11 +179,11 @@ def recording_name(bag: Path) -> str:
     return (folder or bag.with_suffix('')).absolute().name
 
 
-def default_output(bag: Path) -> Path:
+def default_output(bag: Path, name: str = OUTPUT) -> Path:
     """Where the result goes without --out: beside the recording, else into the current folder."""
     folder = _folder(bag)
-    beside = folder / OUTPUT if folder else bag.with_name(f'{recording_name(bag)}-{OUTPUT}')
-    return beside if _writable(beside) else Path(f'{recording_name(bag)}-{OUTPUT}')
+    beside = folder / name if folder else bag.with_name(f'{recording_name(bag)}-{name}')
+    return beside if _writable(beside) else Path(f'{recording_name(bag)}-{name}')
 
 
 def _writable(folder: Path) -> bool:

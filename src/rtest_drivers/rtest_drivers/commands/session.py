@@ -7,16 +7,22 @@ machine; with it a simulated machine cell takes their place, on this host only.
 from __future__ import annotations
 
 import argparse
+import shlex
+import subprocess
+import sys
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rtest_drivers.config import config_path
-from rtest_drivers.graph import GraphSettings, session_name
+from rtest_drivers.graph import RATE, GraphSettings, session_name
 from rtest_drivers.runner import NodeFailed, Stopped, run_session
 from rtest_estimation.errors import UserError
 
-# Simulated seconds per second at which nodes on two processor cores lose nothing.
-RATE = 10.0
+if TYPE_CHECKING:
+    from rtest_estimation.records import CyclePlan
+
 HELP = 'run a measurement session and record it'
 
 
@@ -40,16 +46,15 @@ def add_run_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--out', type=Path, default=Path('out'), metavar='DIR',
                         help='write to DIR/NAME (default: out)')
     parser.add_argument('--rate', type=float, default=RATE, metavar='N',
-                        help=f'simulated seconds per second (default: {RATE:g}; 0 is as fast as '
-                        'the cell can, which loses readings)')
+                        help=f'simulated seconds per second (default: {RATE:g}, at which two '
+                        'processor cores lose nothing; faster may lose readings)')
     parser.add_argument('--domain', type=int, metavar='N',
-                        help='ROS domain (default: ROS_DOMAIN_ID; simulated: a free one)')
+                        help='ROS domain (default: ROS_DOMAIN_ID; simulated: a free one, whatever '
+                        'ROS_DOMAIN_ID is)')
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the session, then identify its recording."""
-    from rtest_drivers.commands.identify import identify
-
     config = (arguments.config or config_path('demo.yaml')).absolute()
     settings = GraphSettings(
         config=config,
@@ -60,37 +65,103 @@ def run(arguments: argparse.Namespace) -> int:
         namespace=arguments.namespace,
         remaps=tuple(arguments.remap),
     )
-    measure(settings, arguments.domain)
-    identify(settings.folder)
+    settings, complete = measure(settings, arguments.domain, bool(arguments.session))
+    evaluate(settings, complete)
     return 0
 
 
-def measure(settings: GraphSettings, domain: int | None) -> None:
+def measure(
+    settings: GraphSettings, domain: int | None, named: bool = False
+) -> tuple[GraphSettings, bool]:
     """Run the graph for one session; says where things are, also when it ends early.
 
+    named : whether the user has chosen the session's name; another is changed where it is taken
+
+    Returns the settings with the name the session got, and whether every cycle was measured.
     Raises UserError, NodeFailed, Stopped.
     """
-    from rtest_identification.plans import load_session
+    from rtest_drivers.domain import chosen_domain
+    from rtest_identification.session_file import load_session
 
-    # Mistakes in the files are told before anything is started; only the cell reads the truth.
-    settings = replace(settings, sphere_radius=load_session(settings.config).sphere_radius)
-    if settings.simulate is not None and not settings.simulate.is_file():
-        raise UserError(f'{settings.simulate}: no such file; expected a truth file (YAML)')
-    if domain is not None and not 0 <= domain <= 232:
-        raise UserError(f'--domain {domain}: expected 0 to 232')
-    if settings.folder.exists():
-        raise UserError(f'{settings.folder}: exists already; choose another --session or --out')
-    try:
-        settings.log.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UserError(f'{settings.out}: cannot be written: {error.strerror}') from None
+    # Mistakes in the files are told before anything is started.
+    config = load_session(settings.config)
+    settings = replace(settings, sphere_radius=config.sphere_radius)
+    chosen_domain(settings.simulate is not None, domain)
+    if settings.simulate is not None:
+        _check_truth(settings.simulate, config.plans)
+    settings = _reserve(settings, named)
     print(f'recording to {shown(settings.recording)}, logs in {shown(settings.log)}', flush=True)
     try:
-        run_session(settings, domain)
+        return settings, run_session(settings, domain)
     except (NodeFailed, Stopped) as error:
         if settings.recording.exists():
-            error.args = (f'{error}\n  recorded so far: {shown(settings.recording)}',)
+            error.args = (
+                f'{error}\n  recorded so far: {shown(settings.recording)}; to identify it: '
+                f'{_again(settings)}',
+            )
         raise
+
+
+def evaluate(settings: GraphSettings, complete: bool) -> Path:
+    """Identify what a session has recorded, also where it is incomplete.
+
+    Returns the path of identification.json. Raises NodeFailed where something is missing.
+    """
+    from rtest_drivers.commands.identify import identify
+
+    try:
+        result = identify(settings.folder, quiet=True)
+    except UserError as error:
+        raise NodeFailed(f'{error}\n  recorded: {shown(settings.recording)}') from None
+    if not complete:
+        raise NodeFailed(
+            f'session {settings.session} is incomplete, see above; the report holds what there '
+            f'is; to identify it again: {_again(settings)}'
+        )
+    return result
+
+
+def _again(settings: GraphSettings) -> str:
+    return f'rtest identify {shlex.quote(shown(settings.folder))}'
+
+
+def _check_truth(truth: Path, plans: Sequence[CyclePlan]) -> None:
+    """Refuse a wrong truth file; tell faults that never occur in these plans.
+
+    In a process of its own: the truth is known to nothing that estimates.
+    """
+    cycles = [f'{plan.cycle}={len(plan.commands)}' for plan in plans]
+    done = subprocess.run(
+        [sys.executable, '-m', 'rtest_drivers.sim.truth', str(truth), *cycles],
+        capture_output=True, text=True, check=False,
+    )
+    if done.returncode == 2:
+        raise UserError(done.stderr)
+    if done.returncode:
+        raise NodeFailed(f'{truth}: could not be checked\n{done.stderr}')
+    for line in done.stdout.splitlines():
+        print(f'warning: {line}', flush=True)
+
+
+def _reserve(settings: GraphSettings, named: bool) -> GraphSettings:
+    """Make the folder of the logs, which nobody else may have unless the user wants this name."""
+    name, number = settings.session, 1
+    while True:
+        if named and settings.folder.exists():
+            raise UserError(
+                f'{settings.folder}: exists already; choose another --session or --out'
+            )
+        try:
+            settings.log.mkdir(parents=True, exist_ok=named)
+            return settings
+        except FileExistsError:
+            if named or not settings.log.is_dir():
+                raise UserError(f'{settings.out}: cannot be written: File exists') from None
+            # Another session was started in the same second.
+            number += 1
+            settings = replace(settings, session=f'{name}-{number}')
+        except OSError as error:
+            raise UserError(f'{settings.out}: cannot be written: {error.strerror}') from None
 
 
 def shown(path: Path) -> str:

@@ -15,7 +15,7 @@ from rtest_msgs.msg import CyclePlan
 from rtest_drivers.cell_link import CHANNELS, CNC, DEFAULT_ADDRESS, GAUGES, CellServer
 from rtest_drivers.nodes.driver import run
 from rtest_drivers.sim.cell import Cell
-from rtest_drivers.sim.truth import load_truth
+from rtest_drivers.sim.truth import load_truth, unmet
 from rtest_estimation.errors import UserError
 from rtest_estimation.messages import MessageError, cycle_plan
 from rtest_estimation.nodes import diagnostics
@@ -50,6 +50,9 @@ class CellNode(Node):
         self._server = CellServer(address)
         self._address, self._refused = address, ''
         self._known: set[tuple[str, str, int]] = set()
+        # Cycles that faults wait for, and what is to be told once.
+        self._unplanned = {f.cycle for f in self._cell.truth.faults if f.cycle is not None}
+        self._warnings: list[str] = []
         self._clock_publisher = self.create_publisher(ClockMessage, '/clock', 10)
         self._diagnostics = diagnostics.Diagnostics(self)
         self._plans = self.create_subscription(CyclePlan, 'rtest/plan', self._plan, LATCHED_100)
@@ -62,6 +65,9 @@ class CellNode(Node):
 
     def close(self) -> None:
         """Hang up on the drivers and remove the socket."""
+        if self._unplanned:
+            cycles = ', '.join(sorted(self._unplanned))
+            self.get_logger().warning(f'faults never met: there was no cycle {cycles}')
         self._server.close()
 
     def _parameter(self, name: str, default: Any, description: str) -> Any:
@@ -82,6 +88,11 @@ class CellNode(Node):
             return
         self._refused = ''
         self._known.add(key)
+        self._unplanned.discard(plan.cycle)
+        faults = [f for f in self._cell.truth.faults if f.cycle == plan.cycle]
+        for line in unmet(faults, {plan.cycle: len(plan.commands)}):
+            self.get_logger().warning(line)
+            self._warnings.append(line)
         self.get_logger().info(f'plan {plan.cycle}: {len(plan.commands)} poses')
 
     def _tick(self) -> None:
@@ -124,8 +135,14 @@ class CellNode(Node):
             'connected': ', '.join(self._server.connected) or 'nobody',
             'plans_waiting': cell.waiting,
         }
-        level = diagnostics.ERROR if self._refused else diagnostics.OK
-        status = diagnostics.status('cell: simulation', level, self._refused or text, values)
+        if self._unplanned:
+            values['faults_wait_for'] = ', '.join(sorted(self._unplanned))
+        level = diagnostics.OK
+        if self._refused:
+            level, text = diagnostics.ERROR, self._refused
+        elif self._warnings:
+            level, text = diagnostics.WARN, self._warnings.pop(0)
+        status = diagnostics.status('cell: simulation', level, text, values)
         status.hardware_id = self._address
         self._diagnostics.publish(status)
 

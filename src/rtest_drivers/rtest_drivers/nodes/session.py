@@ -11,6 +11,7 @@ cycle_timeout : how long a cycle may take [s]; 0 is an estimate from its path
 
 from __future__ import annotations
 
+import math
 import sys
 import time
 from collections.abc import Callable
@@ -29,12 +30,14 @@ from rtest_msgs.msg import CyclePlan as CyclePlanMessage
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
-from rtest_drivers.schedule import NANOSECONDS, path_duration, pose_count
+from rtest_drivers.graph import INCOMPLETE
+from rtest_drivers.schedule import NANOSECONDS, Progress, pose_count
 from rtest_estimation.errors import UserError
+from rtest_estimation.missing import grouped
 from rtest_estimation.nodes import diagnostics, publish
 from rtest_estimation.nodes.qos import LATCHED, LATCHED_100
-from rtest_estimation.records import CyclePlan, Kind
-from rtest_identification.plans import SessionConfig, load_session
+from rtest_estimation.records import CyclePlan, Kind, Missing
+from rtest_identification.session_file import SessionConfig, load_session
 
 DRIVERS = ('gauges', 'cnc')
 # Who must not miss the first reading.
@@ -89,9 +92,11 @@ class SessionNode(Node):
         self._started = self._reported = time.monotonic()
         self._cycles: dict[tuple[str, int], Cycle] = {}
         self._nests: dict[str, NestCalibration] = {}
+        self._open: dict[tuple[str, int], CyclePlan] = {}
         self._poses_done: tuple[str, int, int] | None = None
-        self._finished: tuple[str, dict[str, str]] = ('', {})
-        self._complaints: set[str] = set()
+        self._feedback_age: float | None = None
+        self._finished: dict[str, dict[str, str]] = {}
+        self._complaints: dict[str, tuple[int, set[str]]] = {}
         self._problems: list[str] = []
         self._status = 'waiting for the other nodes'
         self._cycle_number = 0
@@ -114,11 +119,13 @@ class SessionNode(Node):
             self._wait_for('/clock of the simulated cell', lambda: self._now() > 0)
         poses = sum(len(plan.commands) for plan in self.config.plans)
         self.say(f'{self.config.machine.name}: {len(self.config.plans)} cycles, {poses} poses')
+        started = {}
         for number, plan in enumerate(self.config.plans, 1):
             self._cycle_number = number
-            self._measure(plan)
+            started[plan.cycle] = self._measure(plan)
         self._status = 'finishing'
         self._close()
+        self._judge(started)
         self._status = 'finished'
         self._diagnose()
         return self._problems
@@ -137,6 +144,14 @@ class SessionNode(Node):
                 f'{", ".join(names)} (their services {", ".join(missing())} are missing); start '
                 'them in the same ROS domain and namespace'
             )
+        here = self.get_namespace()
+        others = [
+            space for name, space in self.get_node_names_and_namespaces()
+            # A simulated clock is that of the whole domain.
+            if name == self.get_name() and (self.simulated or space == here)
+        ]
+        if len(others) > 1:
+            raise UserError('another session runs in this ROS domain; choose another domain')
 
     def _wait_for_listeners(self) -> None:
         self._status = 'waiting for subscriptions'
@@ -179,54 +194,77 @@ class SessionNode(Node):
         request = ChangeState.Request(transition=Transition(id=transition))
         return self._call(self._change[driver], request, f'{driver}/change_state').success
 
-    def _measure(self, plan: CyclePlan) -> None:
-        """Publish one plan and wait for its finished cycle."""
+    def _measure(self, plan: CyclePlan) -> tuple[str, int]:
+        """Publish one plan and wait for its finished cycle; returns the cycle's key.
+
+        Goes on where the cycle has stopped; it is then finished by the next plan or at the end.
+        """
         stamp = self._now()
         key = (plan.cycle, stamp)
         self._status = f'measuring {plan.cycle}'
-        self._poses_done = None
-        self._complaints.clear()
+        self._poses_done = self._feedback_age = None
+        self._open[key] = plan
         started = replace(plan, session=self.session, stamp=stamp)
         self._plans.publish(publish.cycle_plan(started))
-        limit = self.cycle_timeout or path_duration(plan)
-        clock = (stamp, time.monotonic())
-        shown = time.monotonic()
+        shown, told = time.monotonic(), 0
+        progress = Progress(plan, stamp, shown, self.cycle_timeout)
         while key not in self._cycles:
             self.wait(lambda: key in self._cycles, 0.2)
+            self._tell_finished()
             now, wall = self._now(), time.monotonic()
-            if now != clock[0]:
-                clock = (now, wall)
-            if wall - clock[1] > CLOCK_TIMEOUT_S:
+            if progress.clock_stands(now, wall) > CLOCK_TIMEOUT_S:
                 raise SessionError(f'{plan.cycle}: the clock has stood still for '
                                    f'{CLOCK_TIMEOUT_S:.0f} s; is the simulated cell running?')
-            if (now - stamp) / NANOSECONDS > limit:
-                self._problem(f'{plan.cycle}: not finished after {limit:.0f} s; going on')
-                return
-            if wall - shown > PROGRESS_S and self._poses_done:
-                shown = wall
-                cycle, done, poses = self._poses_done
-                if cycle == plan.cycle and done < poses:
-                    self._say_cycle(plan, f'{done} of {poses} poses')
-        self._say_cycle(plan, self._outcome(plan, self._cycles[key]))
+            if key in self._cycles:
+                break
+            cycle, done, poses = self._poses_done or ('', 0, 0)
+            done = done if cycle == plan.cycle else 0
+            if why := progress.stopped(now, wall, done, self._feedback_age):
+                self.get_logger().warning(f'{plan.cycle}: {why}')
+                self._say_cycle(plan, f'{why}; going on')
+                break
+            if wall - shown > PROGRESS_S and told < done < poses:
+                shown, told = wall, done
+                self._say_cycle(plan, f'{done} of {poses} poses')
+        return key
+
+    def _tell_finished(self) -> None:
+        """Tell the outcome of every cycle that has come, also of one that had stopped before."""
+        for key, plan in list(self._open.items()):
+            if key in self._cycles:
+                del self._open[key]
+                self._say_cycle(plan, self._outcome(plan, self._cycles[key]))
 
     def _outcome(self, plan: CyclePlan, cycle: Cycle) -> str:
         text = pose_count(len(plan.commands), len(cycle.points), len(cycle.missing))
         if cycle.missing:
             # The reasons are on another topic and may come a moment later.
-            self.wait(lambda: self._finished[0].startswith(f'{plan.cycle}:'), 1.0)
-            line, reasons = self._finished
-            if line.startswith(f'{plan.cycle}:') and reasons:
-                pose, reason = next(iter(reasons.items()))
-                text += f' ({pose}: {reason})'
+            self.wait(lambda: plan.cycle in self._finished, 1.0)
+            reasons = self._finished.get(plan.cycle, {})
+            missing = [
+                Missing(int(pose.removeprefix('pose ')), reason)
+                for pose, reason in reasons.items()
+                if pose.startswith('pose ')
+            ]
+            # Every reason is told with the result of the session.
+            first, *more = grouped(missing) or ['']
+            text += f' ({first}{"; ..." if more else ""})' if first else ''
         if plan.kind is Kind.NEST_CALIBRATION:
             # The calibration is on another topic and may come a moment later.
             self.wait(lambda: cycle.calibration in self._nests, 1.0 if cycle.calibration else 0.0)
             nest = self._nests.get(cycle.calibration)
-            if nest is None:
-                self._problems.append(f'{plan.cycle}: no calibration')
-                return f'{text}, no calibration'
-            text += f', residual {nest.residual * 1e6:.2f} µm'
+            text += f', residual {nest.residual * 1e6:.2f} µm' if nest else ', no calibration'
         return text
+
+    def _judge(self, started: dict[str, tuple[str, int]]) -> None:
+        """A cycle that says nothing is a problem; single missing poses are not."""
+        lost = [
+            name for name, key in started.items()
+            # Displacements count from the first point: alone it is zero.
+            if key not in self._cycles or len(self._cycles[key].points) < 2
+        ]
+        if lost:
+            self._problem(f'incomplete: nothing was measured in {", ".join(lost)}')
 
     def _close(self) -> None:
         for name in DRIVERS:
@@ -235,10 +273,12 @@ class SessionNode(Node):
         for name in FINISHERS:
             # Let the last messages of the one before arrive.
             self.wait(lambda: False, SETTLE_S)
+            self._tell_finished()
             answer = self._call(self._finish[name], Trigger.Request(), f'{name}/finish')
-            self.say(f'{name}: {answer.message}')
-            if not answer.success:
-                self._problems.append(f'{name}: {answer.message}')
+            if answer.success:
+                self.say(f'{name}: {answer.message}')
+            else:
+                self._problem(f'{name}: {answer.message}')
 
     # ---- waiting, saying ----
 
@@ -273,7 +313,8 @@ class SessionNode(Node):
         print(f'[{time.monotonic() - self._started:3.0f} s] {text}', flush=True)
 
     def _say_cycle(self, plan: CyclePlan, text: str) -> None:
-        self.say(f'{self._cycle_number}/{len(self.config.plans)} {plan.cycle}: {text}')
+        names = [one.cycle for one in self.config.plans]
+        self.say(f'{names.index(plan.cycle) + 1}/{len(names)} {plan.cycle}: {text}')
 
     def _problem(self, text: str) -> None:
         self._problems.append(text)
@@ -299,15 +340,21 @@ class SessionNode(Node):
                 if {'cycle', 'poses_done', 'poses'} <= values.keys():
                     done, poses = int(values['poses_done']), int(values['poses'])
                     self._poses_done = (values['cycle'], done, poses)
+                age = values.get('feedback_age_s')
+                self._feedback_age = math.inf if age is None else float(age)
             elif status.name == 'estimator: finished cycle':
-                self._finished = (status.message, values)
+                self._finished[status.message.partition(':')[0]] = values
                 continue
-            # Once per cycle: a message may carry numbers that change every second.
+            # Once per cycle: a message may carry numbers that change every second. And not again
+            # where nothing has changed since.
             source = status.name.strip('/').split(':')[0]
             worse = status.level in (diagnostics.WARN, diagnostics.ERROR)
-            if worse and source not in self._complaints and source not in QUIET:
-                self._complaints.add(source)
-                self.say(f'{source}: {status.message}')
+            if worse and source not in QUIET:
+                cycle, told = self._complaints.get(source, (-1, set()))
+                new = [part for part in status.message.split('; ') if part not in told]
+                if cycle != self._cycle_number and new:
+                    self._complaints[source] = (self._cycle_number, told | set(new))
+                    self.say(f'{source}: {"; ".join(new)}')
 
     def _diagnose(self) -> None:
         level = diagnostics.WARN if self._problems else diagnostics.OK
@@ -323,7 +370,11 @@ class SessionNode(Node):
 
 
 def main(args: list[str] | None = None) -> int:
-    """Run the node; 0 when all went through, 1 when something failed, 2 for a user's mistake."""
+    """Run the node; returns the exit status.
+
+    0 when all went through, `INCOMPLETE` when the recording was closed but something is missing in
+    it, 1 when the session could not go on, 2 for a user's mistake.
+    """
     rclpy.init(args=args)
     try:
         problems = SessionNode().run()
@@ -338,9 +389,7 @@ def main(args: list[str] | None = None) -> int:
         return 1
     finally:
         rclpy.try_shutdown()
-    for problem in problems:
-        print(f'session: {problem}', file=sys.stderr)
-    return 1 if problems else 0
+    return INCOMPLETE if problems else 0
 
 
 if __name__ == '__main__':

@@ -37,6 +37,8 @@ class EstimatorNode(Node):
         self._centre_due = 0
         self._damaged: list[str] = []
         self._sequence = SequenceCheck()
+        # Readings that were lost before the current cycle.
+        self._lost_before = 0
         self._last: Finished | None = None
 
         self._nest = self.create_publisher(NestCalibration, 'rtest/nest', LATCHED)
@@ -92,6 +94,7 @@ class EstimatorNode(Node):
 
     def _publish(self, ready: Finished) -> None:
         self._last = ready
+        self._lost_before = self._sequence.lost
         if ready.nest is not None:
             self._nest.publish(publish.nest_calibration(ready.nest))
         self._cycle.publish(publish.cycle(ready.cycle))
@@ -121,14 +124,17 @@ class EstimatorNode(Node):
             'damaged': len(self._damaged),
             'lost_readings': self._sequence.lost,
         }
+        if self._estimator.feedback_stamp:
+            age = self.get_clock().now().nanoseconds - self._estimator.feedback_stamp
+            values['feedback_age_s'] = f'{age / 1e9:.2f}'
         line = 'waiting for a plan'
         if progress is not None:
             plan, done = progress
             values |= {'cycle': plan.cycle, 'poses_done': done, 'poses': len(plan.commands)}
             line = f'{plan.cycle}: {done} of {len(plan.commands)} poses'
         level = diagnostics.OK
-        if self._sequence.lost:
-            level, line = diagnostics.WARN, f'{self._sequence.lost} gauge readings did not arrive'
+        if lost := self._sequence.lost - self._lost_before:
+            level, line = diagnostics.WARN, f'{lost} gauge readings did not arrive'
         if self._damaged:
             level, line = diagnostics.WARN, f'damaged message: {self._damaged[-1]}'
         self._diagnostics.publish(diagnostics.status('estimator: cycle', level, line, values))
