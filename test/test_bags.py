@@ -6,10 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rosbags.highlevel import AnyReader
 
 from rtest_drivers.info import describe
 from rtest_drivers.sim.check import check
 from rtest_estimation.recording import read_recording
+from rtest_identification.gap.offline import gap_recording
 from rtest_identification.offline import identify_recording
 from rtest_identification.output import as_dict, write
 
@@ -41,6 +43,23 @@ def test_command_and_node_agree_bit_for_bit():
     np.testing.assert_array_equal(published.values, data.location.value)
     np.testing.assert_array_equal(published.covariance, data.location.covariance.ravel())
     assert published.residual == data.fit.rms
+
+
+def test_the_model_gap_of_the_node_is_that_of_the_command():
+    with AnyReader([BAGS / 'short']) as reader:
+        raw = [
+            reader.deserialize(data, connection.msgtype)
+            for connection, _, data in reader.messages()
+            if connection.topic == '/rtest/model_gap'
+        ]
+    published = raw[-1]
+    found = gap_recording(BAGS / 'short')
+    assert published.verdict == found.result.verdict
+    assert list(published.effects) == [f.effect.key for f in found.result.found]
+    gap = found.result.gap
+    assert (published.noise, published.before, published.after) == (
+        gap.noise, gap.before, gap.after
+    )
 
 
 def test_the_truth_of_the_simulated_cell_comes_back(tmp_path):
