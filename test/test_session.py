@@ -16,6 +16,8 @@ import pytest
 
 from rtest_drivers.config import config_path
 from rtest_drivers.domain import free_domain
+from rtest_drivers.info import describe
+from rtest_drivers.processes import remove_leftovers
 from rtest_drivers.sim.check import check
 from rtest_estimation.recording import read_recording
 
@@ -36,8 +38,21 @@ setups:
 NODES = ('recorder', 'estimator', 'identifier', 'cell', 'gauges', 'cnc', 'session')
 
 
+def children(pid: int) -> list[str]:
+    return Path(f'/proc/{pid}/task/{pid}/children').read_text().split()
+
+
+def command_of(pid: str) -> str:
+    return Path(f'/proc/{pid}/cmdline').read_bytes().decode(errors='replace')
+
+
+def socket_paths(pid: int) -> list[str]:
+    """Sockets with a name that a process was told of."""
+    return re.findall(r'/[^"\0]*rtest-cell-[^"\0]*\.sock', command_of(str(pid)))
+
+
 class Session:
-    """`rtest session` of one set-up, 3 B x 4 C, in a folder and a ROS domain of its own."""
+    """`rtest session` of one set-up, 3 B x 4 C, in a folder of its own."""
 
     def __init__(self, folder: Path, *more: str) -> None:
         self.out = folder / 'out'
@@ -47,10 +62,13 @@ class Session:
             [
                 sys.executable, '-m', 'rtest_drivers.cli', 'session', '--config', str(config),
                 '--simulate', str(config_path('cell_demo.yaml')), '--session', 'short',
-                '--out', str(self.out), '--domain', str(free_domain()), *more,
+                '--out', str(self.out), *more,
             ],
             stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=folder,
-            env={**os.environ, 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'},
+            # A simulated session is in a domain of its own, whatever the user's.
+            env={
+                **os.environ, 'ROS_DOMAIN_ID': 'none', 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'OFF',
+            },
         )
 
     def end(self, timeout: float = 90.0) -> tuple[int, str, str]:
@@ -79,11 +97,12 @@ class Session:
         return found
 
     def shared_memory(self) -> set[Path]:
-        """Fast DDS segments that belong to the nodes."""
+        """Fast DDS segments and ports that belong to the nodes, and their mutexes."""
         found = set()
         for pid in self.pids().values():
             maps = Path(f'/proc/{pid}/maps').read_text()
-            found |= set(re.findall(r'/dev/shm/fastrtps_[0-9a-f]{16}', maps))
+            found |= set(re.findall(r'/dev/shm/\S*fastrtps_\S+', maps))
+        assert any('_port' in name for name in found)
         return {Path(name) for name in found}
 
     def nothing_runs(self) -> bool:
@@ -118,7 +137,7 @@ def test_a_session_from_calibration_to_identification(start, tmp_path):
     session = start()
     status, out, err = session.end()
     assert status == 0, out + err
-    assert '1/2 1a-nest: ' in out and '2/2 1a-static: 14 of 14 poses' in out
+    assert '1/2 1a-nest: ' in out and out.count('1a-static: 14 of 14 poses') == 1
     assert out.splitlines()[-1].startswith('short: ')
     assert session.nothing_runs()
 
@@ -180,12 +199,93 @@ def test_a_killed_runner_leaves_no_process_and_a_recording_that_opens(start):
     assert read_recording(session.out / 'short').closed
 
 
+def test_what_a_session_left_that_was_killed_altogether_goes_with_the_next(start):
+    session = start()
+    session.wait_for_cycle()
+    files = session.shared_memory()
+    # With their locks and mutexes, which nobody maps for long.
+    files |= {other for path in files for other in path.parent.glob(f'*{path.name}_*')}
+    files |= {Path(path) for path in socket_paths(session.pids()['cell'])}
+    guards = [int(pid) for pid in children(session.process.pid) if 'guard' in command_of(pid)]
+    for pid in [session.process.pid, *guards, *session.pids().values()]:
+        os.kill(pid, signal.SIGKILL)
+    session.process.communicate()
+    assert session.nothing_runs()
+    left = {path for path in files if path.exists()}
+    assert any(path.suffix == '.sock' for path in left) and len(left) > 10
+    for path in left:
+        # As if it had happened a while ago: what is young may belong to a node that starts.
+        os.utime(path, (time.time() - 60.0,) * 2)
+    remove_leftovers()
+    assert not [path for path in left if path.exists()]
+
+
 def test_a_session_in_a_namespace_with_a_remapped_topic(start):
     session = start('--namespace', 'hall/cell_1', '--remap', 'rtest/gauges:=probe/readings')
     status, out, err = session.end()
     assert status == 0, out + err
     topics = read_recording(session.out / 'short').topics
     assert '/hall/cell_1/probe/readings' in topics and '/hall/cell_1/rtest/cycle' in topics
+
+
+def with_faults(folder: Path, faults: str) -> str:
+    """Path of a truth file with these faults."""
+    text = config_path('cell_demo.yaml').read_text()
+    text = text.replace('machine: nmv', f'machine: {config_path("nmv1500dcg.yaml").parent}/nmv')
+    path = folder / 'truth.yaml'
+    path.write_text(f'{text}\nfaults: {faults}\n')
+    return str(path)
+
+
+def test_a_last_pose_that_never_comes_does_not_hold_the_session_up(start, tmp_path):
+    truth = with_faults(tmp_path, """
+  - {kind: lost_block, cycle: 1a-nest, pose: 5}
+  - {kind: pose_skipped, cycle: 1a-static, pose: 13}""")
+    session = start('--simulate', truth)
+    status, out, err = session.end()
+    assert status == 0, out + err
+    assert '2/2 1a-static: 13 of 14 poses, no other pose for ' in out
+    assert '2/2 1a-static: 13 of 14 poses, 1 missing (13: never reached)' in out
+    assert '  missing: 1a-static 13: never reached' in out
+    # What was lost in the first cycle is not told again in the second.
+    assert 'lost' in out and out.count('did not arrive') <= 1
+    assert out.count('readings or messages lost') == 1
+    assert out.splitlines()[-1].startswith('short: ') and '13 of 14 poses' in out.splitlines()[-1]
+    values = [
+        line for line in describe(session.out / 'short') if line.startswith('missing')
+    ]
+    assert values[0] == 'missing   2 of 42 poses'
+    assert values[1:] == [
+        'missing   1a-nest 5: no gauge readings', 'missing   1a-static 13: never reached',
+    ]
+
+
+def test_a_cycle_without_a_point_makes_the_session_incomplete(start, tmp_path):
+    truth = with_faults(tmp_path, '[{kind: gauge_silent, cycle: 1a-static}]')
+    session = start('--simulate', truth)
+    status, out, err = session.end()
+    assert status == 1 and 'Traceback' not in err
+    assert '1a-static: 0 of 14 poses, 14 missing (0-13: no gauge readings)' in out
+    assert 'incomplete: nothing was measured in 1a-static' in out
+    assert '1a-static 0-13: no gauge readings' in err, 'why it could not be identified'
+    recording = read_recording(session.out / 'short')
+    assert recording.closed and len(recording.cycles) == 2
+
+
+def test_a_second_session_in_a_domain_is_refused_and_the_first_goes_on(start, tmp_path):
+    domain = str(free_domain())
+    session = start('--domain', domain)
+    session.wait_for_cycle()
+    other = start('--domain', domain, '--session', 'other')
+    status, out, err = other.end()
+    assert status == 2 and not out and err.count('\n') == 1
+    assert f'a session runs in ROS domain {domain} already' in err
+    assert not (session.out / 'other').exists()
+    # The node by itself finds that out from the graph, before it wakes the drivers.
+    node = run_session_node(tmp_path, domain, 20.0, '-p', 'simulated:=true')
+    assert node.returncode == 2 and 'another session runs in this ROS domain' in node.stderr
+    status, out, err = session.end()
+    assert status == 0, out + err
 
 
 def test_a_mistake_in_the_truth_file_is_one_line(start, tmp_path):
@@ -197,21 +297,27 @@ def test_a_mistake_in_the_truth_file_is_one_line(start, tmp_path):
     assert session.nothing_runs()
 
 
-def test_missing_drivers_are_named(tmp_path):
-    """Without a cell and without drivers in the graph."""
-    config = tmp_path / 'short.yaml'
+def run_session_node(
+    folder: Path, domain: str, timeout: float, *more: str
+) -> subprocess.CompletedProcess:
+    """The node alone, without the runner."""
+    config = folder / 'short.yaml'
     config.write_text(CONFIG.format(machine=config_path('nmv1500dcg.yaml')))
-    done = subprocess.run(
+    return subprocess.run(
         [
             sys.executable, '-m', 'rtest_drivers.nodes.session', '--ros-args',
-            '-p', f'config:={config}', '-p', 'ready_timeout:=3.0',
+            '-p', f'config:={config}', '-p', f'ready_timeout:={timeout}', *more,
         ],
         capture_output=True, text=True, timeout=60,
         env={
-            **os.environ, 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
-            'ROS_DOMAIN_ID': str(free_domain()),
+            **os.environ, 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST', 'ROS_DOMAIN_ID': domain,
         },
     )
+
+
+def test_missing_drivers_are_named(tmp_path):
+    """Without a cell and without drivers in the graph."""
+    done = run_session_node(tmp_path, str(free_domain()), 3.0)
     assert done.returncode == 1
     assert 'gauges, cnc, estimator, identifier, recorder' in done.stderr
     assert 'Traceback' not in done.stderr

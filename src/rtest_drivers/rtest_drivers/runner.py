@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 
-from rtest_drivers.domain import held_domain, session_environment
+from rtest_drivers.domain import session_environment
 from rtest_drivers.graph import (
     INCOMPLETE,
     LAST,
@@ -64,10 +64,8 @@ class Command:
     shown: bool = False
 
 
-def run_session(settings: GraphSettings, domain: int | None = None) -> bool:
-    """Run a session to its end; returns whether every cycle was measured.
-
-    domain : ROS domain; None is the environment's or, for a simulated cell, a free one
+def run_session(settings: GraphSettings, domain: int) -> bool:
+    """Run a session to its end in a ROS domain; returns whether every cycle was measured.
 
     Raises UserError for a user's mistake, NodeFailed, Stopped.
     """
@@ -78,12 +76,7 @@ def run_session(settings: GraphSettings, domain: int | None = None) -> bool:
         if find_spec(module) is None:
             raise UserError(f'cannot import {module}, which a session needs; {remedy}')
     remove_leftovers()
-    simulated = settings.simulate is not None
-    with held_domain(simulated, domain, settings.namespace) as number:
-        return _run_graph(settings, session_environment(simulated, number))
-
-
-def _run_graph(settings: GraphSettings, environment: dict[str, str]) -> bool:
+    environment = session_environment(settings.simulate is not None, domain)
     commands = [
         Command(
             node.name,

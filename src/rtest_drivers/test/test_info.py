@@ -1,5 +1,6 @@
 """What `rtest info` says, on sessions from outside and on files that are hardly one."""
 
+import re
 from pathlib import Path
 
 import pytest
@@ -9,6 +10,7 @@ from rtest_drivers.mcap_file import McapFile
 from rtest_drivers.message_types import MessageTypes
 from rtest_estimation.errors import UserError
 
+SHORT = Path(__file__).resolve().parents[3] / 'bags' / 'short'
 SHARED = Path(__file__).resolve().parents[3].parent / 'shared' / 'sessions'
 
 
@@ -26,6 +28,18 @@ def test_independent_session():
     assert '1a-static: static, 86 poses of X Y Z B C, sphere at (0, -90, 40.6) mm' in text
     assert any('/rtest/gauges' in line and '1816 messages' in line for line in lines)
     assert not any(line.startswith('warning') for line in lines)
+
+
+def test_missing_poses_are_named_with_their_reasons(tmp_path):
+    """Also in a recording that was cut, whose last poses nobody has reported as missing."""
+    lines = describe(SHORT)
+    assert 'missing   0 of 123 poses' in lines
+    data = (SHORT / 'short.mcap').read_bytes()
+    cut = tmp_path / 'cut.mcap'
+    cut.write_bytes(data[: len(data) * 7 // 10])
+    missing = [line for line in describe(cut) if line.startswith('missing')]
+    assert re.fullmatch(r'missing   \d+ of 123 poses', missing[0])
+    assert re.fullmatch(r'missing   centre-static \d+-26: never reached', missing[-1])
 
 
 def test_a_file_that_is_no_session_is_described_with_the_reason(tmp_path):

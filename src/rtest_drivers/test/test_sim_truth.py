@@ -9,7 +9,7 @@ import yaml
 from rtest_drivers.sim.errors import GeometricErrors, parse_errors, split
 from rtest_drivers.sim.fields import Fields
 from rtest_drivers.sim.kinematics import follow, sphere_in_table
-from rtest_drivers.sim.truth import load_truth
+from rtest_drivers.sim.truth import load_truth, main
 from rtest_estimation.errors import UserError
 from rtest_identification.machine import load_machine
 
@@ -149,3 +149,24 @@ def test_the_demo_map_does_not_move_the_location_errors() -> None:
         # A fifth of what noise of 0.25 um leaves: 0.03 um, 0.3 urad.
         slack = 0.006e-6 if split(symbol).component in 'XYZ' else 0.06e-6
         assert value == pytest.approx(expected, abs=slack), symbol
+
+
+def test_a_truth_file_is_checked_with_the_cycles_of_a_session(tmp_path, capsys) -> None:
+    data = yaml.safe_load((CONFIG / 'cell_demo.yaml').read_text())
+    data['machine'] = str(CONFIG / 'nmv1500dcg.yaml')
+    data['faults'] = [
+        {'kind': 'gauge_silent', 'at_s': 1.0, 'for_s': 1.0},
+        {'kind': 'gauge_nan', 'cycle': '1a-static', 'pose': 85},
+        {'kind': 'gauge_error', 'cycle': '1a-static', 'pose': 86},
+        {'kind': 'lost_block', 'cycle': '1c-static'},
+    ]
+    path = tmp_path / 'truth.yaml'
+    path.write_text(yaml.safe_dump(data))
+    assert main([str(path), '1a-nest=28', '1a-static=86']) == 0
+    first, second = capsys.readouterr().out.splitlines()
+    assert 'gauge_error: no pose 86 in 1a-static, which has 86 poses' in first
+    assert "lost_block: no cycle '1c-static' in this session, which has 1a-nest, 1a" in second
+    assert main([str(path)]) == 0 and not capsys.readouterr().out
+    path.write_text('machine: [\n')
+    assert main([str(path)]) == 2
+    assert capsys.readouterr().err.count('\n') == 1

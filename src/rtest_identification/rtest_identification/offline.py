@@ -83,6 +83,11 @@ def identify_recording(
         raise UserError(f'{path}: no machine was recorded; give its file with --machine')
     priors = load_priors(priors_path, machine) if priors_path is not None else None
     model = load_model(model_path) if model_path is not None else None
+    if model and model.machine and model.machine != machine.name:
+        raise UserError(
+            f'{model_path}: a model of machine {model.machine!r}, the recording is of '
+            f'{machine.name!r}; give the model of this machine'
+        )
     finished = estimate_recording(recording, None, progress)
     directions = {f.nest.setup: f.nest.direction for f in finished if f.nest is not None}
     effects = model_columns(model, recording.plans[0].stamp, directions) if model else None
@@ -93,7 +98,8 @@ def identify_recording(
         raise UserError(f'{path}: {error}' + (f' ({why})' if why else '')) from None
     problems = tuple(f'{f.cycle.plan.cycle}: {f.problem}' for f in finished if f.problem)
     warnings = (*recording.warnings, *problems, *result.warnings)
-    return replace(result, warnings=warnings, session=result.session or recording.session)
+    return replace(result, warnings=warnings, session=result.session or recording.session,
+                   model=model.name if model else None)
 
 
 def _in_order(

@@ -16,6 +16,7 @@ from rtest_identification.grid_map import GridMap
 from rtest_identification.location import MAP_SIGNIFICANCE, Effects, Estimate, Fit, fit
 from rtest_identification.machine import Machine
 from rtest_identification.observations import Observations, repeatability, stack
+from rtest_identification.symbols import ErrorParameter
 from rtest_identification.uncertainty import AxisPrior, Budget, Sources, budget
 
 # A residual this improbable at the measured repeatability means that the model lacks something.
@@ -42,6 +43,7 @@ class Identification:
     budget : contributions to the uncertainty of the location errors
     sources : where they come from, for Monte Carlo propagation
     warnings : what to mend or mind before using the numbers; notes : what holds for every R-test
+    model : name of the model whose effects were free besides
     disagreement : rms of what more than three gauges leave of each other, by cycle [m]
     poses : planned in all static cycles, measured or not
     """
@@ -60,6 +62,7 @@ class Identification:
     warnings: tuple[str, ...]
     notes: tuple[str, ...] = ()
     disagreement: dict[str, float] = field(default_factory=dict)
+    model: str | None = None
     poses: int = 0
 
     @property
@@ -108,7 +111,8 @@ def identify(
         )
     observations = stack(replace(machine, tool=machine.tool + offset), cycles)
     result = fit(observations, effects)
-    _refuse_other_machine(machine, result)
+    known = np.where(result.location.determined, result.location.value, np.nan)
+    refuse_other_machine(machine, result.location.parameters, known, result.rms)
     noise, freedom = repeatability(cycles)
     errors = np.zeros((len(machine.letters), 6))
     errors.flat[[p.column for p in result.location.parameters]] = result.location.value
@@ -139,18 +143,19 @@ def identify(
     )
 
 
-def _refuse_other_machine(machine: Machine, result: Fit) -> None:
-    """Raise UserError where the machine file cannot be that of the recording."""
-    location = result.location
+def refuse_other_machine(
+    machine: Machine, parameters: Sequence[ErrorParameter], values: np.ndarray, rms: float
+) -> None:
+    """Raise UserError where the machine file cannot be that of the recording.
+
+    values : identified constants [m] or [rad], NaN where not determined; rms : residual [m]
+    """
     text = f'machine {machine.name!r} does not fit this recording: '
     hint = '; check chain, direction and sense of the axes in the machine file'
-    if result.rms > LARGEST_RESIDUAL:
-        raise UserError(f'{text}residual {result.rms * 1e3:.1f} mm{hint}')
-    for p, value, good in zip(
-        location.parameters, location.value, location.determined, strict=True
-    ):
-        limit = LARGEST_ANGLE if p.angular else LARGEST_LENGTH
-        if good and abs(value) > limit:
+    if rms > LARGEST_RESIDUAL:
+        raise UserError(f'{text}residual {rms * 1e3:.1f} mm{hint}')
+    for p, value in zip(parameters, values, strict=True):
+        if abs(value) > (LARGEST_ANGLE if p.angular else LARGEST_LENGTH):
             raise UserError(f'{text}{p.symbol} would be {value:.3g} {p.unit}{hint}')
 
 

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import yaml
 
+from rtest_estimation.dwell import DwellRules
 from rtest_estimation.errors import UserError
 from rtest_estimation.records import CyclePlan, Kind
-from rtest_identification.machine import Machine, load_machine
+from rtest_identification.machine import Axis, Machine, load_machine
 from rtest_identification.moves import Approach, Speeds
 from rtest_identification.plan_check import Spindle, Table
 from rtest_identification.plans import (
@@ -23,8 +26,20 @@ from rtest_identification.plans import (
     spindle_runout,
     static,
 )
+from rtest_identification.session_reader import Reader
 
 STATIC, DIAGNOSTIC = 'static', 'diagnostic'
+# Fewer do not tell offset, sine and cosine of an error over the axis from each other.
+FEWEST_STATIONS = 3
+# Closer ones are one pose for the machine and for who looks for its stops.
+CLOSEST_DEG = 0.1
+# What can be meant: half of a dwell at least is used; steps that the gauges see and reach.
+_DWELL_S = (2.0 * DwellRules().settle, 60.0)
+_STEP_MM = (0.05, 5.0)
+_RADIUS_MM = (1.0, 100.0)
+# Six points tell a circle from noise.
+_RUNOUT_STATIONS = (6, 360)
+_NAME = re.compile(r'[A-Za-z0-9][A-Za-z0-9._-]*')
 _BUILD = {STATIC: static, DIAGNOSTIC: diagnostic}
 _KEYS = {
     'machine', 'sphere_radius_mm', 'cycle', 'nest_calibration', 'spindle_runout', 'setups',
@@ -74,34 +89,36 @@ def load_session(path: Path | str, kind: str | None = None) -> SessionConfig:
         raise UserError(f'{path}: not valid YAML: {" ".join(str(error).split())}') from None
     if not isinstance(data, dict):
         raise UserError(f'{path}: expected a mapping with machine, cycle and setups')
-    reader = _Reader(str(path), data)
+    reader = Reader(str(path), data)
     reader.only(_KEYS)
     machine = load_machine(path.parent / str(reader.required('machine')))
-    radius = reader.number('sphere_radius_mm', 12.7) * 1e-3
+    radius = reader.number('sphere_radius_mm', 12.7, _RADIUS_MM) * 1e-3
     kind, stations, dwell = _cycle(reader, machine, kind)
     nest = reader.section('nest_calibration', {'step_mm', 'dwell_s'})
-    step, nest_dwell = nest.number('step_mm', 1.0) * 1e-3, nest.number('dwell_s', 0.3)
+    step = nest.number('step_mm', 1.0, _STEP_MM) * 1e-3
+    nest_dwell = nest.number('dwell_s', 0.3, _DWELL_S)
     plans: list[CyclePlan] = []
     setups = reader.required('setups')
     if not isinstance(setups, dict) or not setups:
         raise UserError(f'{path}: setups: expected a mapping of names to sphere_mm')
-    for name, spec in setups.items():
-        setup = _Reader(f'{path}: setups: {name}', spec if isinstance(spec, dict) else {})
+    for name, spec in zip(_names(f'{path}: setups', setups), setups.values(), strict=True):
+        setup = Reader(f'{path}: setups: {name}', spec if isinstance(spec, dict) else {})
         setup.only({'sphere_mm'})
         sphere = np.array(setup.numbers('sphere_mm', 3)) * 1e-3
-        name = str(name)
         plans.append(nest_calibration(machine, name, sphere, step, nest_dwell))
         if not any(plan.kind is Kind.SPINDLE_RUNOUT for plan in plans):
             runout = data.get('spindle_runout')
             if runout is not None:
                 section = reader.section('spindle_runout', {'stations', 'dwell_s'})
-                count = round(section.number('stations', 24))
-                plans.append(
-                    spindle_runout(machine, name, sphere, count, section.number('dwell_s', 0.3))
-                )
+                count = section.integer('stations', 24, _RUNOUT_STATIONS)
+                runout_dwell = section.number('dwell_s', 0.3, _DWELL_S)
+                plans.append(spindle_runout(machine, name, sphere, count, runout_dwell))
         plans.append(_BUILD[kind](machine, name, sphere, *stations, dwell))
     for plan in plans:
-        check_ranges(machine, plan)
+        try:
+            check_ranges(machine, plan)
+        except UserError as error:
+            raise UserError(f'{path}: setups: {plan.setup}: {error}') from None
     return SessionConfig(
         machine, radius, tuple(plans), kind, stations, _speeds(reader), _approach(reader),
         _table(reader), _spindle(reader), data,
@@ -109,7 +126,7 @@ def load_session(path: Path | str, kind: str | None = None) -> SessionConfig:
 
 
 def _cycle(
-    reader: _Reader, machine: Machine, wanted: str | None
+    reader: Reader, machine: Machine, wanted: str | None
 ) -> tuple[str, tuple[np.ndarray, ...], float]:
     """Kind, stations of each rotary axis [rad], dwell [s]."""
     keys = {name: f'{name.lower()}_deg' for name in machine.rotary}
@@ -125,8 +142,48 @@ def _cycle(
         ):
             stations.append(np.radians(UNEVEN_DEG))
         else:
-            stations.append(np.radians(cycle.numbers(key)))
-    return kind, tuple(stations), cycle.number('dwell_s', 0.3)
+            stations.append(np.radians(_stations(cycle, key, machine.axes[name])))
+    return kind, tuple(stations), cycle.number('dwell_s', 0.3, _DWELL_S)
+
+
+def _stations(cycle: Reader, key: str, axis: Axis) -> list[float]:
+    """Stations of a rotary axis [deg] that it can reach, enough of them and each once."""
+    degrees = cycle.numbers(key)
+    if len(degrees) < FEWEST_STATIONS:
+        raise UserError(
+            f'{cycle.where}: {key}: expected {FEWEST_STATIONS} stations or more, got '
+            f'{len(degrees)}: fewer do not tell the errors of {axis.name} from each other'
+        )
+    ordered = sorted(degrees)
+    for first, second in pairwise(ordered):
+        if second - first < CLOSEST_DEG:
+            raise UserError(
+                f'{cycle.where}: {key}: {first:g} and {second:g} are one and the same station; '
+                f'expected {CLOSEST_DEG:g} deg between two or more'
+            )
+    lower, upper = math.degrees(axis.lower), math.degrees(axis.upper)
+    for value in (ordered[0], ordered[-1]):
+        if not lower - 1e-6 <= value <= upper + 1e-6:
+            raise UserError(
+                f'{cycle.where}: {key}: {value:g} is outside the range of {axis.name}, '
+                f'{lower:g} to {upper:g} deg'
+            )
+    return degrees
+
+
+def _names(where: str, setups: dict) -> list[str]:
+    """Names of the set-ups as texts; they become names of cycles and files."""
+    names: list[str] = []
+    for key in setups:
+        name = '' if key is None else str(key)
+        if not _NAME.fullmatch(name):
+            raise UserError(
+                f'{where}: {key!r}: expected a name of letters, digits, dot, dash, underscore'
+            )
+        if name in names:
+            raise UserError(f'{where}: {name}: given twice')
+        names.append(name)
+    return names
 
 
 def full_turn(machine: Machine, name: str) -> bool:
@@ -135,7 +192,7 @@ def full_turn(machine: Machine, name: str) -> bool:
     return axis.lower <= 0.0 and axis.upper >= math.radians(max(UNEVEN_DEG))
 
 
-def _speeds(reader: _Reader) -> Speeds:
+def _speeds(reader: Reader) -> Speeds:
     section = reader.section('moves', {'linear_mm_min', 'rotary_deg_min', 'clearance_mm',
                                        'approach_mm_min', 'direction'})
     default = Speeds()
@@ -145,8 +202,8 @@ def _speeds(reader: _Reader) -> Speeds:
     )
 
 
-def _approach(reader: _Reader) -> Approach:
-    section = _Reader(f'{reader.where}: moves', reader.data.get('moves', {}))
+def _approach(reader: Reader) -> Approach:
+    section = Reader(f'{reader.where}: moves', reader.data.get('moves', {}))
     default = Approach()
     direction = default.direction
     if 'direction' in section.data:
@@ -163,7 +220,7 @@ def _approach(reader: _Reader) -> Approach:
     )
 
 
-def _table(reader: _Reader) -> Table | None:
+def _table(reader: Reader) -> Table | None:
     if 'table' not in reader.data:
         return None
     section = reader.section(
@@ -179,61 +236,10 @@ def _table(reader: _Reader) -> Table | None:
     )
 
 
-def _spindle(reader: _Reader) -> Spindle | None:
+def _spindle(reader: Reader) -> Spindle | None:
     if 'spindle' not in reader.data:
         return None
     section = reader.section('spindle', {'radius_mm', 'distance_mm'})
     for key in ('radius_mm', 'distance_mm'):
         section.required(key)
     return Spindle(*(section.number(k, 0.0) * 1e-3 for k in ('radius_mm', 'distance_mm')))
-
-
-class _Reader:
-    """Typed look-ups in a YAML mapping whose errors name file and key."""
-
-    def __init__(self, where: str, data: dict) -> None:
-        self.where, self.data = where, data
-
-    def only(self, known: set[str]) -> None:
-        for key in self.data:
-            if key not in known:
-                raise UserError(
-                    f'{self.where}: unknown key {key!r}, expected one of {sorted(known)}'
-                )
-
-    def required(self, key: str) -> Any:
-        if key not in self.data:
-            raise UserError(f'{self.where}: {key}: missing')
-        return self.data[key]
-
-    def section(self, key: str, known: set[str]) -> _Reader:
-        value = self.data.get(key, {})
-        if not isinstance(value, dict):
-            raise UserError(f'{self.where}: {key}: expected a mapping of {sorted(known)}')
-        section = _Reader(f'{self.where}: {key}', value)
-        section.only(known)
-        return section
-
-    def number(self, key: str, default: float) -> float:
-        value = self.data.get(key, default)
-        if isinstance(value, bool) or not isinstance(value, int | float) or not value > 0:
-            raise UserError(f'{self.where}: {key}: expected a positive number, got {value!r}')
-        return float(value)
-
-    def real(self, key: str) -> float:
-        """A number of either sign."""
-        value = self.required(key)
-        if isinstance(value, bool) or not isinstance(value, int | float) or value - value != 0:
-            raise UserError(f'{self.where}: {key}: expected a number, got {value!r}')
-        return float(value)
-
-    def numbers(self, key: str, count: int | None = None) -> list[float]:
-        value = self.required(key)
-        good = isinstance(value, list) and all(
-            isinstance(v, int | float) and not isinstance(v, bool) and math.isfinite(v)
-            for v in value
-        )
-        if not good or not value or (count and len(value) != count):
-            wanted = f'{count} numbers' if count else 'a list of numbers'
-            raise UserError(f'{self.where}: {key}: expected {wanted}, got {value!r}')
-        return [float(v) for v in value]

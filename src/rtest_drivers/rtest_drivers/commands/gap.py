@@ -44,11 +44,13 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _one(bag: Path, model: object, arguments: argparse.Namespace, out: Path) -> None:
     from rtest_drivers.commands.session import shown
+    from rtest_drivers.folders import check_folder, writing
     from rtest_identification.gap import output
     from rtest_identification.gap.model_file import save_model
     from rtest_identification.gap.offline import gap_recording
     from rtest_identification.gap.report import write_report
 
+    check_folder(out)
     found = gap_recording(
         bag, model, arguments.effects, arguments.machine,
         lambda line: print(f'  {line}', flush=True),
@@ -57,10 +59,11 @@ def _one(bag: Path, model: object, arguments: argparse.Namespace, out: Path) -> 
         print(f'  warning: {warning}')
     for line in found.confusions:
         print(f'  {line}')
-    save_model(found.model, out / 'model.yaml')
-    path = output.write(found.session, found.result, out, 'model.yaml')
-    if not arguments.no_report:
-        write_report(found, out)
+    with writing(out):
+        save_model(found.model, out / 'model.yaml')
+        path = output.write(found.session, found.result, out, 'model.yaml')
+        if not arguments.no_report:
+            write_report(found, out)
     for line in output.lines(found.result):
         print(f'  {line}')
     print(f'{recording_name(bag)}: {output.summary(found.result)} -> {shown(path.absolute())}',

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 HELP = 'identify the errors of a machine from recordings'
 OUTPUT = 'identification'
+# With fewer trials a standard uncertainty is not known to 10 %.
+MIN_TRIALS = 100
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -46,6 +48,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Identify every recording."""
+    if arguments.trials and arguments.trials < MIN_TRIALS:
+        raise UserError(f'--monte-carlo {arguments.trials}: expected {MIN_TRIALS} trials or more')
     several = len(arguments.bags) > 1
     for bag in arguments.bags:
         out = arguments.out / recording_name(bag) if arguments.out and several else arguments.out
@@ -134,7 +138,7 @@ def _trials(result: Identification, trials: int) -> list[str]:
     from rtest_identification.uncertainty import NOISE, monte_carlo
 
     scatter = replace(result.location, covariance=result.budget.parts[NOISE])
-    draws = monte_carlo(scatter, result.sources, result.fit.rms, max(trials, 100))
+    draws = monte_carlo(scatter, result.sources, result.fit.rms, trials)
     found = draws.covariance.diagonal() ** 0.5
     return [f'{trials} trials: standard uncertainty by Monte Carlo / linear propagation'] + [
         f'  {p.symbol:10} {1e6 * one:8.3f} /{1e6 * other:8.3f} {"µrad" if p.angular else "µm"}'

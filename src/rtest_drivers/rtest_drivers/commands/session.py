@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rtest_drivers.config import config_path
+from rtest_drivers.domain import held_domain
 from rtest_drivers.graph import RATE, GraphSettings, session_name
 from rtest_drivers.runner import NodeFailed, Stopped, run_session
 from rtest_estimation.errors import UserError
@@ -80,19 +81,22 @@ def measure(
     Returns the settings with the name the session got, and whether every cycle was measured.
     Raises UserError, NodeFailed, Stopped.
     """
-    from rtest_drivers.domain import chosen_domain
     from rtest_identification.session_file import load_session
 
     # Mistakes in the files are told before anything is started.
     config = load_session(settings.config)
     settings = replace(settings, sphere_radius=config.sphere_radius)
-    chosen_domain(settings.simulate is not None, domain)
-    if settings.simulate is not None:
+    simulated = settings.simulate is not None
+    if simulated:
         _check_truth(settings.simulate, config.plans)
-    settings = _reserve(settings, named)
-    print(f'recording to {shown(settings.recording)}, logs in {shown(settings.log)}', flush=True)
     try:
-        return settings, run_session(settings, domain)
+        with held_domain(simulated, domain, settings.namespace) as number:
+            settings = _reserve(settings, named)
+            print(
+                f'recording to {shown(settings.recording)}, logs in {shown(settings.log)}',
+                flush=True,
+            )
+            return settings, run_session(settings, number)
     except (NodeFailed, Stopped) as error:
         if settings.recording.exists():
             error.args = (
@@ -144,24 +148,26 @@ def _check_truth(truth: Path, plans: Sequence[CyclePlan]) -> None:
 
 
 def _reserve(settings: GraphSettings, named: bool) -> GraphSettings:
-    """Make the folder of the logs, which nobody else may have unless the user wants this name."""
+    """Make the folder of the logs; where the user has not chosen a name, one that nobody has."""
     name, number = settings.session, 1
     while True:
-        if named and settings.folder.exists():
+        taken = settings.folder.exists()
+        if taken and named:
             raise UserError(
                 f'{settings.folder}: exists already; choose another --session or --out'
             )
         try:
-            settings.log.mkdir(parents=True, exist_ok=named)
-            return settings
+            if not taken:
+                settings.log.mkdir(parents=True, exist_ok=named)
+                return settings
         except FileExistsError:
             if named or not settings.log.is_dir():
                 raise UserError(f'{settings.out}: cannot be written: File exists') from None
-            # Another session was started in the same second.
-            number += 1
-            settings = replace(settings, session=f'{name}-{number}')
         except OSError as error:
             raise UserError(f'{settings.out}: cannot be written: {error.strerror}') from None
+        # Another session was started in the same second.
+        number += 1
+        settings = replace(settings, session=f'{name}-{number}')
 
 
 def shown(path: Path) -> str:

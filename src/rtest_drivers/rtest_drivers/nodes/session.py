@@ -144,6 +144,8 @@ class SessionNode(Node):
                 f'{", ".join(names)} (their services {", ".join(missing())} are missing); start '
                 'them in the same ROS domain and namespace'
             )
+        # Who is found last may be another session.
+        self.wait(lambda: False, SETTLE_S)
         here = self.get_namespace()
         others = [
             space for name, space in self.get_node_names_and_namespaces()

@@ -19,6 +19,7 @@ from rtest_identification.gap.workflow import Found, GapResult, analyse
 from rtest_identification.machine import Machine, load_machine, parse_machine
 from rtest_identification.observations import stack
 from rtest_identification.offline import estimate_recording
+from rtest_identification.pipeline import refuse_other_machine
 
 
 @dataclass(frozen=True)
@@ -78,11 +79,19 @@ def gap_session(
     more: Sequence[Effect] = (),
 ) -> SessionGap:
     """Run the workflow on the finished cycles of a session: for command and node alike."""
+    if model and model.machine and model.machine != machine.name:
+        raise UserError(
+            f'model {model.name!r} is of machine {model.machine!r}, the recording of '
+            f'{machine.name!r}; give the model of this machine'
+        )
     cycles = sorted(cycles, key=lambda c: (c.plan.stamp, c.plan.cycle))
     observations = stack(machine, cycles)
     start = min(cycle.plan.stamp for cycle in cycles)
     name = next((c.plan.session for c in cycles if c.plan.session), '')
     result = analyse(observations, start, directions, model, more)
+    refuse_other_machine(
+        machine, result.constants.parameters, result.constants.value, result.gap.before
+    )
     return SessionGap(name, result, extend(model, machine, result, name, start))
 
 

@@ -8,6 +8,7 @@ import os
 from pathlib import Path
 from typing import Any
 
+from rtest_identification.gap.where import Place
 from rtest_identification.gap.workflow import Found, GapResult
 
 
@@ -97,5 +98,16 @@ def lines(result: GapResult) -> list[str]:
             told.append(f'  to tell them apart: {found.separate_by}')
     if result.verdict in ('unknown effect', 'partly explained'):
         for place in result.where[:5]:
-            told.append(f'unexplained at {place.by} = {place.value}: rms {place.rms * 1e6:.2f} µm')
+            told.append(f'unexplained at {where(place)}: rms {place.rms * 1e6:.2f} µm')
     return told
+
+
+def where(place: Place) -> str:
+    """A place for a person: degrees, seconds, words."""
+    if isinstance(place.value, str):
+        return f'{place.by} {place.value}'
+    if place.by.startswith('direction of'):
+        return f'{place.by} {"+" if place.value > 0 else "-"}'
+    if place.by == 'time':
+        return f'times from {place.value:.0f} s'
+    return f'{place.by} = {math.degrees(place.value):.1f} deg'

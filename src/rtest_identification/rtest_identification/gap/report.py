@@ -54,7 +54,7 @@ def write_report(found: SessionGap, out: Path) -> Path:
     )
     page = environment.get_template('gap.html.j2').render(
         found=found, result=found.result, summary=output.summary(found.result),
-        lines=output.lines(found.result), pictures=pictures,
+        lines=output.lines(found.result), pictures=pictures, where=output.where,
     )
     path = out / 'gap_report.html'
     part = path.with_name(path.name + '.part')

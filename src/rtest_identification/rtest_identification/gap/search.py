@@ -14,6 +14,7 @@ from rtest_identification.gap.rows import Rows
 
 # A candidate of which less than this is left beside the base model is invisible in these data.
 VISIBLE = 0.02
+NOTHING = 1e-9
 # Probability of taking the best of all candidates for real where there is nothing.
 FALSE_ALARM = 0.001
 # Candidates less than 100 times less likely are rivals.
@@ -103,11 +104,14 @@ class Projection:
 
     def project(self, rows: Rows, effect: Effect, shape: tuple[float, ...]) -> Candidate | None:
         """What is left of an effect beside the base model; None where nothing is."""
-        columns = rows.white(effect.columns(rows.scene, shape))
-        norm = np.linalg.norm(columns, axis=0)
-        if not (norm > 0).any():
+        raw = effect.columns(rows.scene, shape)
+        # A column of rounding errors is no signature: less than a nanometre per unit.
+        moves = np.abs(raw).max(axis=(0, 1)) > NOTHING
+        if not moves.any():
             return None
-        whole, size, _ = np.linalg.svd(columns[:, norm > 0] / norm[norm > 0], full_matrices=False)
+        columns = rows.white(raw[:, :, moves])
+        norm = np.linalg.norm(columns, axis=0)
+        whole, size, _ = np.linalg.svd(columns / norm, full_matrices=False)
         whole = whole[:, size > 1e-6 * size[0]]
         u, s, _ = np.linalg.svd(whole - self.base @ (self.base.T @ whole), full_matrices=False)
         kept = u[:, s > VISIBLE]

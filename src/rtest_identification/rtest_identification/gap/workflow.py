@@ -121,11 +121,14 @@ def analyse(
         first = search(Projection(rows, effects))
     chosen, spread = _refine(rows, first.named)
     named, verdict, rest = _judge(rows, first, chosen)
+    held = _hold_out(rows, effects)
+    if named and held[1] > held[0]:
+        # What makes poses that took no part worse is not there, whatever it does to the others.
+        named, verdict = (), 'unknown effect'
     found = _size(rows, named, chosen, spread, more)
     after = make_rows(
         observations, start, directions, [*model, *((f.effect, f.shape) for f in found)]
     )
-    held = _hold_out(rows, effects)
     gap = Gap(
         float(np.sqrt(np.mean(rows.sigma**2))), _rms(rows.residual, rows.base),
         _rms(after.residual, after.base), *held,
@@ -180,7 +183,8 @@ def _solve(design: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, f
     """Value, cofactor and sum of squares of a least-squares problem, columns scaled."""
     norm = np.maximum(np.linalg.norm(design, axis=0), 1e-300)
     u, s, vt = np.linalg.svd(design / norm, full_matrices=False)
-    good = s > 1e-6 * s[0]
+    # Held-out poses show at once what a nearly open combination would be extrapolated to.
+    good = s > RANK_TOLERANCE * s[0]
     inverse = vt[good].T / s[good]
     value = inverse @ (u[:, good].T @ y) / norm
     cofactor = inverse @ inverse.T / np.outer(norm, norm)
