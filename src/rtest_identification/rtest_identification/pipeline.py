@@ -62,8 +62,8 @@ class Identification:
     warnings: tuple[str, ...]
     notes: tuple[str, ...] = ()
     disagreement: dict[str, float] = field(default_factory=dict)
-    model: str | None = None
     poses: int = 0
+    model: str | None = None
 
     @property
     def location(self) -> Estimate:
