@@ -77,8 +77,12 @@ class Session:
 
     def wait_for_cycle(self) -> None:
         """Wait until the first cycle is finished."""
+        self.wait_for('residual')
+
+    def wait_for(self, words: str) -> None:
+        """Wait until these words are said."""
         for line in self.process.stdout:
-            if '1a-nest:' in line and 'residual' in line:
+            if words in line:
                 return
         pytest.fail(self.process.stderr.read())
 
@@ -281,8 +285,16 @@ def test_a_second_session_in_a_domain_is_refused_and_the_first_goes_on(start, tm
     assert status == 2 and not out and err.count('\n') == 1
     assert f'a session runs in ROS domain {domain} already' in err
     assert not (session.out / 'other').exists()
-    # The node by itself finds that out from the graph, before it wakes the drivers.
-    node = run_session_node(tmp_path, domain, 20.0, '-p', 'simulated:=true')
+    status, out, err = session.end()
+    assert status == 0, out + err
+
+
+def test_the_session_node_itself_finds_another_one_in_the_graph(start, tmp_path):
+    """As under ros2 launch, before it wakes the drivers."""
+    domain = str(free_domain())
+    session = start('--domain', domain, '--rate', '2')
+    session.wait_for(' cycles, ')
+    node = run_session_node(tmp_path, domain, 20.0)
     assert node.returncode == 2 and 'another session runs in this ROS domain' in node.stderr
     status, out, err = session.end()
     assert status == 0, out + err
@@ -297,16 +309,14 @@ def test_a_mistake_in_the_truth_file_is_one_line(start, tmp_path):
     assert session.nothing_runs()
 
 
-def run_session_node(
-    folder: Path, domain: str, timeout: float, *more: str
-) -> subprocess.CompletedProcess:
+def run_session_node(folder: Path, domain: str, timeout: float) -> subprocess.CompletedProcess:
     """The node alone, without the runner."""
     config = folder / 'short.yaml'
     config.write_text(CONFIG.format(machine=config_path('nmv1500dcg.yaml')))
     return subprocess.run(
         [
             sys.executable, '-m', 'rtest_drivers.nodes.session', '--ros-args',
-            '-p', f'config:={config}', '-p', f'ready_timeout:={timeout}', *more,
+            '-p', f'config:={config}', '-p', f'ready_timeout:={timeout}',
         ],
         capture_output=True, text=True, timeout=60,
         env={

@@ -139,7 +139,7 @@ def identify(
     return Identification(
         session, machine, observations, result, noise, freedom, runout, shares, sources, outliers,
         missing, tuple(warnings), tuple(notes) + _about_priors(priors), _disagreement(cycles),
-        sum(len(cycle.plan.commands) for cycle in cycles if cycle.plan.kind is Kind.STATIC),
+        poses=sum(len(c.plan.commands) for c in cycles if c.plan.kind is Kind.STATIC),
     )
 
 

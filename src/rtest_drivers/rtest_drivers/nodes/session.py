@@ -49,6 +49,8 @@ FINISHERS = ('estimator', 'identifier', 'recorder')
 SERVICE_TIMEOUT_S = 120.0
 # A subscription is seen in the graph a little before its publisher has matched it [s].
 SETTLE_S = 0.5
+# All nodes of a busy graph are found after this time [s].
+OTHERS_S = 3.0
 PROGRESS_S = 2.0
 # Warnings of these nodes are told at the end, or are our own.
 QUIET = ('identifier', 'session')
@@ -144,8 +146,8 @@ class SessionNode(Node):
                 f'{", ".join(names)} (their services {", ".join(missing())} are missing); start '
                 'them in the same ROS domain and namespace'
             )
-        # Who is found last may be another session.
-        self.wait(lambda: False, SETTLE_S)
+        # Who is found last may be another session. A simulated one has its domain for itself.
+        self.wait(lambda: False, SETTLE_S if self.simulated else OTHERS_S)
         here = self.get_namespace()
         others = [
             space for name, space in self.get_node_names_and_namespaces()
