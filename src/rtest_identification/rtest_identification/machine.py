@@ -132,7 +132,7 @@ def _axis(name: str, spec: Any, where: str) -> Axis:
     if not isinstance(spec, dict):
         raise UserError(f'{where}: expected a mapping with type and direction')
     kind = spec.get('type')
-    if kind not in _AXIS_KEYS:
+    if not isinstance(kind, str) or kind not in _AXIS_KEYS:
         raise UserError(f"{where}: type: expected 'linear' or 'rotary', got {kind!r}")
     _only(spec, _AXIS_KEYS[kind], where)
     direction = _vector(spec.get('direction'), f'{where}: direction')
@@ -158,7 +158,8 @@ def _number(value: Any) -> bool:
 
 
 def _vector(value: Any, where: str) -> np.ndarray:
-    if not (isinstance(value, list) and len(value) == 3 and all(map(_number, value))):
+    good = isinstance(value, list) and len(value) == 3 and all(map(_number, value))
+    if not good or not all(map(math.isfinite, value)):
         raise UserError(f'{where}: expected three numbers, got {value!r}')
     return np.array(value, dtype=float)
 
