@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import select
 import signal
 import subprocess
 import sys
@@ -211,10 +212,19 @@ def test_what_a_session_left_that_was_killed_altogether_goes_with_the_next(start
     files |= {other for path in files for other in path.parent.glob(f'*{path.name}_*')}
     files |= {Path(path) for path in socket_paths(session.pids()['cell'])}
     guards = [int(pid) for pid in children(session.process.pid) if 'guard' in command_of(pid)]
-    for pid in [session.process.pid, *guards, *session.pids().values()]:
+    pids = [session.process.pid, *guards, *session.pids().values()]
+    # A process has no command line any more while its last threads still hold their locks; its
+    # descriptor tells when all have ended.
+    descriptors = [os.pidfd_open(pid) for pid in pids]
+    for pid in pids:
         os.kill(pid, signal.SIGKILL)
+    for descriptor in descriptors:
+        assert select.select([descriptor], [], [], 15.0)[0]
+        os.close(descriptor)
     session.process.communicate()
     assert session.nothing_runs()
+    # What came between the listing and the end belongs to the same segments.
+    files |= {other for path in files for other in path.parent.glob(f'*{path.name}_*')}
     left = {path for path in files if path.exists()}
     assert any(path.suffix == '.sock' for path in left) and len(left) > 10
     for path in left:
