@@ -212,7 +212,8 @@ def test_what_a_session_left_that_was_killed_altogether_goes_with_the_next(start
     files |= {other for path in files for other in path.parent.glob(f'*{path.name}_*')}
     files |= {Path(path) for path in socket_paths(session.pids()['cell'])}
     guards = [int(pid) for pid in children(session.process.pid) if 'guard' in command_of(pid)]
-    pids = [session.process.pid, *guards, *session.pids().values()]
+    # The guards first: they would end the nodes properly.
+    pids = [*guards, session.process.pid, *session.pids().values()]
     # A process has no command line any more while its last threads still hold their locks; its
     # descriptor tells when all have ended.
     descriptors = [os.pidfd_open(pid) for pid in pids]
