@@ -175,7 +175,9 @@ def test_the_json_has_the_promised_shape():
     data = as_dict('made', run(EFFECTS['scale/X'], 36), 'model.yaml')
     json.dumps(data, allow_nan=False)
     assert set(data) >= {'verdict', 'effects', 'invisible', 'where', 'gap', 'model'}
-    assert set(data['gap']) == {'noise', 'before', 'after', 'heldout_before', 'heldout_after'}
+    assert set(data['gap']) == {
+        'noise', 'before', 'after', 'heldout_before', 'heldout_after', 'heldout_noise',
+    }
     assert set(data['effects'][0]) >= {
         'key', 'symbol', 'name', 'parameters', 'stddev', 'confidence', 'rivals', 'separate_by',
     }

@@ -16,6 +16,7 @@ import numpy as np
 
 from rtest_identification.gap.scene import Scene
 from rtest_identification.machine import Machine
+from rtest_identification.symbols import ErrorParameter
 
 # Orders of harmonics offered, for an axis that turns fully and for one that swivels.
 _ORDERS_FULL, _ORDERS_SWIVEL = (1, 2, 3, 4, 5, 6), (1, 2)
@@ -66,6 +67,16 @@ def library(scene: Scene) -> list[Effect]:
     found += _thermal(machine)
     found += _instrument(scene)
     return found
+
+
+def location(parameter: ErrorParameter) -> Effect:
+    """A location or squareness error that a model leaves out."""
+    return Effect(
+        f'location/{parameter.symbol}', f'{parameter.symbol}, which the model leaves out',
+        f'{parameter.symbol} is not zero', (parameter.symbol,),
+        (Parameter('value', parameter.unit),),
+        _motion(parameter.axis, (parameter.letter, lambda scene: np.ones(len(scene.time)))),
+    )
 
 
 def _motion(axis: str, *terms: tuple[str, Callable[[Scene], np.ndarray]]) -> Columns:
@@ -241,8 +252,9 @@ def _linear(machine: Machine, axis: str, scene: Scene) -> Iterator[Effect]:
         )
     low, high = scene.span(axis)
     if high - low > 0.02:
-        # Half a wave more each: neighbours differ by what the range can tell apart.
-        lengths = tuple((2.0 * (high - low) / k,) for k in range(2, 17))
+        # A quarter of a wave more each: half of what the range can tell apart, so that the best
+        # length lies in the valley of one of them.
+        lengths = tuple((4.0 * (high - low) / k,) for k in range(4, 33))
         yield Effect(
             f'linear-cyclic/{axis}', f'cyclic error of {axis}',
             f'{own} = p cos(2 pi {axis.lower()}/L) + q sin(2 pi {axis.lower()}/L)', (own,),

@@ -14,8 +14,10 @@ from rtest_estimation.recording import read_recording
 from rtest_estimation.records import Cycle
 from rtest_identification.gap.effects import Effect, library
 from rtest_identification.gap.model_file import Model, ModelEffect, Value
+from rtest_identification.gap.rows import nest_spread
+from rtest_identification.gap.size import Found
 from rtest_identification.gap.user_effects import confusions, load_effects
-from rtest_identification.gap.workflow import Found, GapResult, analyse
+from rtest_identification.gap.workflow import GapResult, analyse
 from rtest_identification.machine import Machine, load_machine, parse_machine
 from rtest_identification.observations import stack
 from rtest_identification.offline import estimate_recording
@@ -88,7 +90,7 @@ def gap_session(
     observations = stack(machine, cycles)
     start = min(cycle.plan.stamp for cycle in cycles)
     name = next((c.plan.session for c in cycles if c.plan.session), '')
-    result = analyse(observations, start, directions, model, more)
+    result = analyse(observations, start, directions, model, more, spread=nest_spread(cycles))
     refuse_other_machine(
         machine, result.constants.parameters, result.constants.value, result.gap.before
     )
@@ -107,10 +109,18 @@ def extend(
             strict=True,
         )
     }
+    missing = [f for f in result.found if f.effect.key.startswith('location/')]
+    for found in missing:
+        # An error that the model left out is freed like the others from now on.
+        (parameter,) = found.effect.parameters
+        values[found.effect.symbols[0]] = Value(
+            float(found.value[0]), float(found.stddev[0]), parameter.unit
+        )
     old = model.effects if model else ()
     return Model(
         model.name if model else f'{machine.name or "machine"} after {session}', machine.name,
-        values, (*old, *(_entry(f, result, session, when) for f in result.found)),
+        values,
+        (*old, *(_entry(f, result, session, when) for f in result.found if f not in missing)),
     )
 
 

@@ -8,8 +8,9 @@ import os
 from pathlib import Path
 from typing import Any
 
+from rtest_identification.gap.size import Found
 from rtest_identification.gap.where import Place
-from rtest_identification.gap.workflow import Found, GapResult
+from rtest_identification.gap.workflow import GapResult
 
 
 def as_dict(session: str, result: GapResult, model: str | None = None) -> dict[str, Any]:
@@ -30,6 +31,7 @@ def as_dict(session: str, result: GapResult, model: str | None = None) -> dict[s
             'after': gap.after,
             'heldout_before': _number(gap.heldout_before),
             'heldout_after': _number(gap.heldout_after),
+            'heldout_noise': _number(gap.heldout_noise),
         },
         'probability': result.probability,
         'rest_probability': result.rest_probability,
@@ -86,6 +88,7 @@ def lines(result: GapResult) -> list[str]:
     for found in result.found:
         sizes = ', '.join(
             f'{p.name} = {v:.3g} ± {2 * s:.2g} {p.unit}'
+            if math.isfinite(s) else f'{p.name} open in these data'
             for p, v, s in zip(
                 (*found.effect.parameters, *found.effect.shape), found.value, found.stddev,
                 strict=True,

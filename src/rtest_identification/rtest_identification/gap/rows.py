@@ -4,22 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
-from scipy import stats
 
-from rtest_identification.error_map import stations
+from rtest_estimation.records import Cycle, Kind
 from rtest_identification.gap.effects import Effect
+from rtest_identification.gap.noise import Noise, estimate, whiten
 from rtest_identification.gap.scene import Scene
 from rtest_identification.least_squares import solve
 from rtest_identification.observations import Observations
-from rtest_identification.symbols import location_parameters
+from rtest_identification.symbols import ErrorParameter, location_parameters
 
-# Levels of the outer axis are as noisy as each other unless it is this improbable.
-EQUAL_NOISE = 0.01
-# With fewer rows that repeat what others say, the noise is not known well enough by level.
-FEW_REPEATS = 300
-_ITERATIONS = 5
+_ITERATIONS = 3
 
 
 @dataclass(frozen=True)
@@ -31,7 +28,11 @@ class Rows:
     base : (n, 3, r) columns of everything that is free in it
     sigma : (n,) standard deviation of a row, per component [m]
     freedom : degrees of freedom that sigma rests on
-    errors : (p,) location errors and squareness about which the rows stand
+    correlation : of the noise of a pose with that of the next
+    nests : (n, 3, q) what a standard uncertainty of each nest calibration does to the rows [m]
+    odd : (n,) poses that are far outside the noise
+    constants : location errors and squareness that are free, the first columns of `base`
+    errors : (p,) their values about which the rows stand
     """
 
     scene: Scene
@@ -39,6 +40,10 @@ class Rows:
     base: np.ndarray
     sigma: np.ndarray
     freedom: int
+    correlation: float
+    nests: np.ndarray
+    odd: np.ndarray
+    constants: tuple[ErrorParameter, ...]
     errors: np.ndarray
 
     def keep(self, chosen: np.ndarray) -> Rows:
@@ -48,13 +53,50 @@ class Rows:
             scene, observations=scene.observations.keep(chosen), jacobian=scene.jacobian[chosen],
             fitted=scene.fitted[chosen],
         )
-        return Rows(part, self.residual[chosen], self.base[chosen], self.sigma[chosen],
-                    self.freedom, self.errors)
+        return replace(
+            self, scene=part, residual=self.residual[chosen], base=self.base[chosen],
+            sigma=self.sigma[chosen], nests=self.nests[chosen], odd=self.odd[chosen],
+        )
 
     def white(self, values: np.ndarray) -> np.ndarray:
-        """(n, 3) or (n, 3, p) to (3 n,) or (3 n, p) of unit variance."""
+        """(n, 3) or (n, 3, p) to (3 n,) or (3 n, p) of unit variance, uncorrelated."""
+        values = self._scaled(values)
+        u, less = self._shared
+        return values - u @ ((less * (u.T @ values).T).T)
+
+    def _scaled(self, values: np.ndarray) -> np.ndarray:
         scaled = values / self.sigma.reshape(-1, *[1] * (values.ndim - 1))
-        return scaled.reshape(-1, *values.shape[2:])
+        observations = self.scene.observations
+        whiten(scaled, self.correlation, observations.cycle, observations.pose)
+        return scaled.reshape(3 * len(values), *values.shape[2:])
+
+    @cached_property
+    def _shared(self) -> tuple[np.ndarray, np.ndarray]:
+        """Directions of the nests' errors, and by how much whitening shrinks each.
+
+        With the covariance I + N N', N = U S V', whitening is I - U (1 - 1 / sqrt(1 + S^2)) U'.
+        """
+        u, s, _ = np.linalg.svd(self._scaled(self.nests), full_matrices=False)
+        return u, 1.0 - 1.0 / np.sqrt(1.0 + s**2)
+
+
+def nest_spread(cycles: Sequence[Cycle]) -> dict[str, np.ndarray]:
+    """How uncertain the axes of each set-up's nest are, per metre of noise: (3,) by set-up [1/m].
+
+    A nest is calibrated by steps x_j of the sphere (Eq. 2-5). Noise e_j of the sphere in the
+    dwells turns the nest's axes by sum e_j x_j' (sum x_j x_j')^-1, so that a displacement x is
+    found wrong by as much of x: nothing at the start of a cycle, more the larger the machine's
+    errors are.
+    """
+    found = {}
+    for cycle in cycles:
+        if cycle.plan.kind is Kind.NEST_CALIBRATION and len(cycle.points) > 3:
+            linear = [cycle.plan.axes.index(name) for name in 'XYZ']
+            steps = np.array([point.feedback[linear] for point in cycle.points])
+            square = ((steps - steps.mean(axis=0)) ** 2).sum(axis=0)
+            if (square > 0.0).all():
+                found[cycle.plan.setup] = 1.0 / np.sqrt(square)
+    return found
 
 
 def make_rows(
@@ -62,40 +104,70 @@ def make_rows(
     start: int,
     directions: Mapping[str, np.ndarray],
     extra: Sequence[tuple[Effect, tuple[float, ...]]] = (),
+    constants: Sequence[ErrorParameter] | None = None,
+    spread: Mapping[str, np.ndarray] | None = None,
 ) -> Rows:
     """Fit the base model and estimate the noise.
 
     start : of the session [ns]
     directions : of the gauges by set-up
     extra : effects that the model has besides, with their shape
+    constants : location errors and squareness that are free; all that the machine has when omitted
+    spread : of the nests, from `nest_spread`; they are taken as exact when omitted
     """
-    constants = location_parameters(observations.machine)
-    columns = [p.column for p in constants]
-    errors = np.zeros(len(constants))
-    table = np.zeros((len(observations.machine.letters), 6))
-    offsets = observations.offsets()
-    sigma = np.ones(len(observations))
-    freedom = 0
-    base = residual = scene = None
+    if constants is None:
+        constants = location_parameters(observations.machine)
+    equal = Noise(np.ones(len(observations)), 0, 0.0, np.zeros(len(observations), dtype=bool))
+    rows = None
     for _ in range(_ITERATIONS):
-        table.flat[columns] = errors
-        predicted, jacobian = observations.predict(table, jacobian=True)
-        left = observations.displacement - predicted
-        fitted = predicted - predicted[_starts(observations)]
-        scene = Scene(observations, jacobian, fitted, start, directions)
-        more = [effect.columns(scene, shape) for effect, shape in extra]
-        base = np.concatenate([jacobian[:, :, columns], offsets, *more], axis=2)
-        weight = 1.0 / sigma[:, None]
-        design = (base * weight[:, :, None]).reshape(-1, base.shape[2])
-        scale = 1.0 / np.maximum(np.linalg.norm(design, axis=0), 1e-300)
-        solution = solve(design, (left * weight).reshape(-1), scale)
-        change = solution.value[: len(errors)]
-        errors = errors + change
-        residual = left - base @ solution.value
-        sigma, freedom = _noise(scene, base, residual)
-        if np.abs(change).max() < 1e-13:
-            break
-    return Rows(scene, residual, base, sigma, freedom, errors)
+        # The noise does not depend on where the errors stand, once they are near.
+        errors = np.zeros(len(constants)) if rows is None else rows.errors
+        rows = _fit(observations, start, directions, extra, tuple(constants), errors, equal)
+    noise = estimate(rows.scene, rows.base, rows.residual)
+    nests = _nest_errors(rows.scene, noise, spread or {})
+    return _fit(observations, start, directions, extra, rows.constants, rows.errors, noise, nests)
+
+
+def _nest_errors(scene: Scene, noise: Noise, spread: Mapping[str, np.ndarray]) -> np.ndarray:
+    """(n, 3, 9 k) what one standard uncertainty of each element of a nest's axes does [m]."""
+    observations = scene.observations
+    level = float(np.sqrt(np.mean(noise.sigma**2)))
+    found = [np.zeros((len(observations), 3, 0))]
+    for number, setup in enumerate(observations.setups):
+        if setup in spread:
+            mine = (observations.cycle == number)[:, None] * scene.fitted * spread[setup] * level
+            found.append(np.einsum('nj,ik->nijk', mine, np.eye(3)).reshape(len(mine), 3, 9))
+    return np.concatenate(found, axis=2)
+
+
+def _fit(
+    observations: Observations,
+    start: int,
+    directions: Mapping[str, np.ndarray],
+    extra: Sequence[tuple[Effect, tuple[float, ...]]],
+    constants: tuple[ErrorParameter, ...],
+    errors: np.ndarray,
+    noise: Noise,
+    nests: np.ndarray | None = None,
+) -> Rows:
+    """One step of Gauss and Newton from `errors`."""
+    columns = [p.column for p in constants]
+    table = np.zeros((len(observations.machine.letters), 6))
+    table.flat[columns] = errors
+    predicted, jacobian = observations.predict(table, jacobian=True)
+    left = observations.displacement - predicted
+    fitted = predicted - predicted[_starts(observations)]
+    scene = Scene(observations, jacobian, fitted, start, directions)
+    more = [effect.columns(scene, shape) for effect, shape in extra]
+    base = np.concatenate([jacobian[:, :, columns], observations.offsets(), *more], axis=2)
+    if nests is None:
+        nests = np.zeros((len(observations), 3, 0))
+    rows = Rows(scene, left, base, noise.sigma, noise.freedom, noise.correlation, nests, noise.odd,
+                constants, errors)
+    design = rows.white(base)
+    scale = 1.0 / np.maximum(np.linalg.norm(design, axis=0), 1e-300)
+    value = solve(design, rows.white(left), scale).value
+    return replace(rows, residual=left - base @ value, errors=errors + value[: len(errors)])
 
 
 def _starts(observations: Observations) -> np.ndarray:
@@ -105,94 +177,3 @@ def _starts(observations: Observations) -> np.ndarray:
         for number in range(len(observations.cycles))
     ])
     return first[observations.cycle]
-
-
-def cells(scene: Scene) -> list[np.ndarray]:
-    """Rows at each pose of the rotary axes."""
-    index = [stations(scene.position(axis))[1] for axis in scene.machine.rotary]
-    key = np.stack(index, axis=1)
-    _, inverse = np.unique(key, axis=0, return_inverse=True)
-    return [np.flatnonzero(inverse.ravel() == k) for k in range(inverse.max() + 1)]
-
-
-def cell_basis(scene: Scene, rows: np.ndarray) -> np.ndarray:
-    """(3 m, k) orthonormal: what any error of the rotary axes could do at one pose of theirs."""
-    axis = scene.machine.rotary[-1]
-    design = np.stack([scene.slope(axis, letter)[rows] for letter in 'XYZABC'], axis=2)
-    u, s, _ = np.linalg.svd(design.reshape(-1, 6) * [1, 1, 1, 10, 10, 10], full_matrices=False)
-    return u[:, s > 1e-3 * s[0]]
-
-
-def _smooth(scene: Scene) -> np.ndarray:
-    """(n, 3, p): the inner axis's six errors, to twice a turn, at every level of the outer one."""
-    outer, inner = scene.machine.rotary
-    places, level = stations(scene.position(outer))
-    turn = scene.position(inner)
-    waves = [np.ones_like(turn)] + [f(n * turn) for n in (1, 2) for f in (np.cos, np.sin)]
-    columns = [
-        scene.slope(inner, letter) * (wave * (level == k))[:, None]
-        for letter in 'XYZABC' for wave in waves for k in range(len(places))
-    ]
-    return np.stack(columns, axis=2)
-
-
-def _noise(scene: Scene, base: np.ndarray, residual: np.ndarray) -> tuple[np.ndarray, int]:
-    """Standard deviation of every row from the richest model, by levels of the outer axis.
-
-    The richest model lets the rotary axes do anything at each of their poses, so that none of
-    their effects is taken for noise; to it come what depends on the direction of approach and,
-    slowly, on time. What is left are differences between set-ups and visits.
-    """
-    observations = scene.observations
-    time = scene.time - scene.time.mean()
-    time = time / max(np.abs(time).max(), 1e-9)
-    extras = [base]
-    for axis in scene.machine.letters:
-        for letter in 'XYZ':
-            moved = scene.slope(scene.machine.rotary[0], letter) * scene.direction(axis)[:, None]
-            extras.append(moved[:, :, None])
-    for power in (1, 2, 3):
-        extras += [
-            (scene.slope(scene.machine.rotary[0], c) * time[:, None] ** power)[:, :, None]
-            for c in 'XYZ'
-        ]
-    for axis in scene.machine.linear:
-        place = scene.position(axis)
-        extras += [(scene.slope(axis, c) * place[:, None])[:, :, None] for c in 'ABCXYZ']
-    y = residual.reshape(-1).copy()
-    count = np.full(len(observations), 3.0)
-    poses = [(rows, cell_basis(scene, rows)) for rows in cells(scene)]
-    repeated = residual.size - sum(basis.shape[1] for _, basis in poses)
-    if repeated < FEW_REPEATS:
-        # Too little is seen twice: the rotary axes may do only what is smooth in the inner one.
-        poses = []
-        extras.append(_smooth(scene))
-    design = np.concatenate(extras, axis=2).reshape(residual.size, -1)
-    flat = np.arange(residual.size).reshape(-1, 3)
-    for rows, basis in poses:
-        place = flat[rows].reshape(-1)
-        design[place] -= basis @ (basis.T @ design[place])
-        y[place] -= basis @ (basis.T @ y[place])
-        count[rows] -= (basis**2).sum(axis=1).reshape(-1, 3).sum(axis=1)
-    norm = np.linalg.norm(design, axis=0)
-    u, s, _ = np.linalg.svd(design[:, norm > 0] / norm[norm > 0], full_matrices=False)
-    u = u[:, s > 1e-6 * s[0]]
-    y -= u @ (u.T @ y)
-    count -= (u**2).sum(axis=1).reshape(-1, 3).sum(axis=1)
-    square = (y.reshape(-1, 3) ** 2).sum(axis=1)
-    freedom = round(count.sum())
-    if freedom < 30:
-        # Too little is repeated: the base model's own residual has to do.
-        free = max(residual.size - base.shape[2], 1)
-        return np.full(len(observations), np.sqrt((residual**2).sum() / free)), free
-    pooled = square.sum() / count.sum()
-    level = stations(np.abs(scene.position(scene.machine.rotary[0])))[1]
-    share = np.bincount(level, count)
-    own = np.bincount(level, square) / np.maximum(share, 1e-9)
-    good = share >= 25
-    # Bartlett's test on the variances of the levels.
-    statistic = share[good].sum() * np.log(pooled) - (share[good] * np.log(own[good])).sum()
-    if good.sum() >= 2 and stats.chi2.sf(statistic, good.sum() - 1) < EQUAL_NOISE:
-        variance = np.where(good, own, pooled)
-        return np.sqrt(variance[level]), freedom
-    return np.full(len(observations), np.sqrt(pooled)), freedom

@@ -24,9 +24,9 @@ from rtest_identification.gap.formula import (
     shown,
 )
 from rtest_identification.gap.plain_yaml import read_plain
+from rtest_identification.gap.projection import Projection
 from rtest_identification.gap.rows import Rows
 from rtest_identification.gap.scene import Scene
-from rtest_identification.gap.search import Projection
 from rtest_identification.gap.units import EXPECTED, to_si
 from rtest_identification.machine import Machine
 from rtest_identification.symbols import symbol

@@ -1,0 +1,131 @@
+"""How large the effects are that were named: what the data show of them, with uncertainty."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from rtest_identification.gap.effects import Effect
+from rtest_identification.gap.projection import VISIBLE
+from rtest_identification.gap.rows import Rows
+from rtest_identification.gap.search import Named
+from rtest_identification.gap.separate import separate
+
+# A parameter of which this share is in what the data do not show is not determined.
+_HIDDEN_SHARE = 0.05
+
+Chosen = tuple[Effect, tuple[float, ...]]
+
+
+@dataclass(frozen=True)
+class Found:
+    """An effect that was added, with its size.
+
+    value, stddev : of `effect.parameters`, then of its shape
+    separate_by : the measurement that would tell it from its rivals
+    """
+
+    effect: Effect
+    shape: tuple[float, ...]
+    value: np.ndarray
+    stddev: np.ndarray
+    confidence: float
+    rivals: tuple[str, ...]
+    separate_by: str
+
+
+def sizes(
+    rows: Rows,
+    named: Sequence[Named],
+    chosen: Sequence[Chosen],
+    more: Sequence[Effect],
+) -> tuple[Found, ...]:
+    """Every parameter with its standard uncertainty."""
+    if not named:
+        return ()
+    value, cofactor, rest = visible(rows, chosen)
+    free = 3 * len(rows.residual) - rows.base.shape[2] - len(value)
+    variance = max(rest / max(free, 1), 1.0) * np.diag(cofactor)
+    spread = _spread(rows, chosen)
+    for place, width in enumerate(spread):
+        if np.isfinite(width):
+            # What the others become where the shape is a standard uncertainty off.
+            low, high = (
+                visible(rows, _reshaped(chosen, place, chosen[place][1][0] + step))[0]
+                for step in (-width, width)
+            )
+            variance = variance + (0.5 * (high - low)) ** 2
+    stddev = np.sqrt(variance)
+    found, column = [], 0
+    for (effect, shape), width, name in zip(chosen, spread, named, strict=True):
+        part = slice(column, column + len(effect.parameters))
+        column = part.stop
+        found.append(
+            Found(
+                effect, shape, np.append(value[part], shape),
+                np.append(stddev[part], [width] * len(shape)), name.confidence, name.rivals,
+                separate(rows, effect, name.rivals, more),
+            )
+        )
+    return tuple(found)
+
+
+def visible(
+    rows: Rows, chosen: Sequence[tuple[Effect, tuple[float, ...]]]
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Parameters of effects beside the base model, cofactor, and sum of squares.
+
+    Combinations of parameters that the base model can take over are not in the data: they are set
+    to zero, so that a size is stated only for what is seen.
+    """
+    base = rows.white(rows.base)
+    u, s, _ = np.linalg.svd(
+        base / np.maximum(np.linalg.norm(base, axis=0), 1e-300), full_matrices=False
+    )
+    u = u[:, s > 1e-6 * s[0]]
+    y = rows.white(rows.residual)
+    y = y - u @ (u.T @ y)
+    columns = rows.white(np.concatenate([e.columns(rows.scene, s) for e, s in chosen], axis=2))
+    norm = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
+    columns = columns / norm
+    v, s, wt = np.linalg.svd(columns - u @ (u.T @ columns), full_matrices=False)
+    good = s > VISIBLE
+    inverse = wt[good].T / s[good]
+    value = inverse @ (v[:, good].T @ y)
+    rest = float(y @ y - ((v[:, good].T @ y) ** 2).sum())
+    cofactor = inverse @ inverse.T / np.outer(norm, norm)
+    # What lies partly in a combination that is set to zero may have any size.
+    open_ones = (wt[~good] ** 2).sum(axis=0) > _HIDDEN_SHARE**2
+    cofactor[open_ones, open_ones] = np.inf
+    return value / norm, cofactor, rest
+
+
+def _spread(rows: Rows, chosen: Sequence[Chosen]) -> list[float]:
+    """Standard uncertainties of the shapes, from the curvature of the sum of squares."""
+    spread = [float('nan')] * len(chosen)
+    for place, (effect, shape) in enumerate(chosen):
+        if len(shape) != 1:
+            continue
+
+        def cost(value: float, place: int = place) -> float:
+            return visible(rows, _reshaped(chosen, place, value))[2]
+
+        (best,), values = shape, [s[0] for s in effect.grid]
+        width = max(values) - min(values) or 1.0
+        # Out to where the sum of squares is one more: that far the shape is as likely as not.
+        here = cost(best)
+        ends = []
+        for sign in (-1.0, 1.0):
+            step = 1e-4 * width
+            while step < width and cost(best + sign * step) < here + 1.0:
+                step *= 1.5
+            ends.append(step)
+        spread[place] = float(np.mean(ends))
+    return spread
+
+
+def _reshaped(chosen: Sequence[Chosen], place: int, shape: float) -> list[Chosen]:
+    """The same effects, the one at `place` with another shape."""
+    return [*chosen[:place], (chosen[place][0], (shape,)), *chosen[place + 1 :]]
