@@ -16,6 +16,7 @@ from rtest_estimation.records import (
     Missing,
     NestCalibration,
     NestKind,
+    Temperature,
 )
 
 # A period or a channel count beyond these is a damaged message, not a gauge.
@@ -72,6 +73,22 @@ def feedback(message: Any) -> Feedback:
             f'JointState has {len(axes)} names and {position.size} positions, expected one each'
         )
     return Feedback(nanoseconds(message.header.stamp), axes, position)
+
+
+def temperature(message: Any) -> Temperature:
+    """`sensor_msgs/Temperature` to a `Temperature`; its frame names the sensor.
+
+    Raises MessageError where the frame is no name that a formula could use, or the value no number.
+    """
+    sensor, value = str(message.header.frame_id), float(message.temperature)
+    if not (sensor.isascii() and sensor.isidentifier()):
+        raise MessageError(
+            f'Temperature.header.frame_id is {sensor!r}, expected the name of the sensor in '
+            'letters, digits and _'
+        )
+    if not np.isfinite(value):
+        raise MessageError(f'Temperature of {sensor} is {value}')
+    return Temperature(nanoseconds(message.header.stamp), sensor, value)
 
 
 def cycle_plan(message: Any) -> CyclePlan:

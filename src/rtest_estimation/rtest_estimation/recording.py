@@ -9,11 +9,13 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, TypeVar
 
+import numpy as np
+
 from rtest_estimation import messages
 from rtest_estimation.bagfile import Bag, read_bag
 from rtest_estimation.errors import UserError
 from rtest_estimation.message_reader import DamagedMessage
-from rtest_estimation.records import CyclePlan, Feedback, GaugeBlock
+from rtest_estimation.records import CyclePlan, Feedback, GaugeBlock, Temperature
 from rtest_estimation.sequence import SequenceCheck
 
 # What a recording is read for: message type and the name the graph gives the topic.
@@ -26,7 +28,8 @@ ROLES = {
     'cycle': ('rtest_msgs/msg/Cycle', 'rtest/cycle'),
     'location_errors': ('rtest_msgs/msg/LocationErrors', 'rtest/location_errors'),
 }
-TYPES = frozenset(message_type for message_type, _ in ROLES.values())
+TEMPERATURE = 'sensor_msgs/msg/Temperature'
+TYPES = frozenset((*(message_type for message_type, _ in ROLES.values()), TEMPERATURE))
 NEEDED = {
     'gauges': 'gauge readings',
     'feedback': 'encoder feedback',
@@ -35,7 +38,7 @@ NEEDED = {
 # Gaps that a warning lists one by one.
 LISTED_GAPS = 5
 
-Stamped = TypeVar('Stamped', GaugeBlock, Feedback, CyclePlan)
+Stamped = TypeVar('Stamped', GaugeBlock, Feedback, CyclePlan, Temperature)
 
 
 @dataclass(frozen=True)
@@ -84,12 +87,7 @@ def read_recording(path: str | Path, topics: Mapping[str, str] | None = None) ->
 def recording_of(bag: Bag, topics: Mapping[str, str] | None = None) -> Recording:
     """The session in a bag that was read with `TYPES`; see `read_recording`."""
     warnings = list(bag.warnings)
-    chosen = {role: find_topic(bag, role, (topics or {}).get(role)) for role in ROLES}
-    for role, name in NEEDED.items():
-        if chosen[role] is None:
-            message_type, topic = ROLES[role]
-            why = bag.warnings[0] if bag.warnings else 'record the session with this topic'
-            raise UserError(f'{bag.path}: no {name} (topic /{topic}, type {message_type}); {why}')
+    chosen = _find_topics(bag, topics)
     arrived = _convert(bag, chosen['gauges'], messages.gauge_block, warnings)
     lost = _check_sequence(arrived, chosen['gauges'], bag.start, warnings)
     gauges = _in_order(arrived, chosen['gauges'], bag.start, warnings)
@@ -125,6 +123,42 @@ def recording_of(bag: Bag, topics: Mapping[str, str] | None = None) -> Recording
         lost,
         bag.closed,
     )
+
+
+def recorded_machine(bag: Bag, topics: Mapping[str, str] | None = None) -> str | None:
+    """YAML of the machine alone, None where it was not recorded; raises as `read_recording`."""
+    machine = _raw_messages(bag, _find_topics(bag, topics)['machine'], [])
+    return str(machine[-1].data) if machine else None
+
+
+def temperatures(bag: Bag, warnings: list[str]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Sensor to stamps [ns], in order, and temperatures [deg C], whatever the topic.
+
+    warnings : to which is added what had to be left out
+    """
+    records = [
+        record
+        for topic, (message_type, _) in bag.topics.items()
+        if message_type == TEMPERATURE
+        for record in _convert(bag, topic, messages.temperature, warnings)
+    ]
+    found: dict[str, tuple[list[int], list[float]]] = {}
+    for record in sorted(records, key=lambda record: record.stamp):
+        stamps, values = found.setdefault(record.sensor, ([], []))
+        stamps.append(record.stamp)
+        values.append(record.value)
+    return {sensor: (np.array(t), np.array(v)) for sensor, (t, v) in found.items()}
+
+
+def _find_topics(bag: Bag, topics: Mapping[str, str] | None) -> dict[str, str | None]:
+    """Topic of every role; raises UserError where one is missing that is needed."""
+    chosen = {role: find_topic(bag, role, (topics or {}).get(role)) for role in ROLES}
+    for role, name in NEEDED.items():
+        if chosen[role] is None:
+            message_type, topic = ROLES[role]
+            why = bag.warnings[0] if bag.warnings else 'record the session with this topic'
+            raise UserError(f'{bag.path}: no {name} (topic /{topic}, type {message_type}); {why}')
+    return chosen
 
 
 def find_topic(bag: Bag, role: str, name: str | None = None) -> str | None:

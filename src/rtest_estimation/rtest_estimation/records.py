@@ -74,6 +74,15 @@ class Feedback:
 
 
 @dataclass(frozen=True)
+class Temperature:
+    """Reading of a thermometer. stamp : [ns]; sensor : its name; value : [deg C]."""
+
+    stamp: int
+    sensor: str
+    value: float
+
+
+@dataclass(frozen=True)
 class CyclePlan:
     """What the machine is commanded to do in one measurement cycle.
 

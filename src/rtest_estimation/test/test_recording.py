@@ -14,8 +14,10 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as RosbagsWriter
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from rtest_estimation.bagfile import read_bag
 from rtest_estimation.errors import UserError
-from rtest_estimation.recording import read_recording
+from rtest_estimation.recording import TYPES as READ
+from rtest_estimation.recording import read_recording, recorded_machine, temperatures
 from rtest_estimation.records import Kind
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -77,6 +79,10 @@ def plan(cycle='1a-static', stamp=START, session='test', kind=0, commands=None):
         0.3,
         0.0,
     )
+
+
+def temperature(sensor, value, stamp):
+    return TYPES['sensor_msgs/msg/Temperature'](header(stamp, sensor), value, 0.0)
 
 
 class BagMaker:
@@ -513,3 +519,39 @@ def test_what_is_no_recording_at_all(tmp_path):
     (tmp_path / 'bare.db3').touch()
     with pytest.raises(UserError, match=r'bare\.db3: .*metadata\.yaml'):
         read_recording(tmp_path / 'bare.db3')
+
+
+def test_the_machine_alone_is_that_of_the_recording(tmp_path):
+    bag = read_bag(make_session(tmp_path / 'bag.mcap', {'machine': '/about'}).path, READ)
+    assert recorded_machine(bag) == MACHINE
+    bag = BagMaker(tmp_path / 'none.mcap')
+    bag.add('/rtest/plan', plan())
+    bag.add('/rtest/gauges', gauges(0))
+    with pytest.raises(UserError, match='no encoder feedback'):
+        recorded_machine(read_bag(bag.close(), READ))
+
+
+def test_temperatures_by_sensor_in_order(tmp_path):
+    bag = BagMaker(tmp_path / 'bag.mcap')
+    bag.add('/rtest/temperature', temperature('oil', 21.5, START + 20))
+    bag.add('/rtest/temperature', temperature('bed', 19.0, START + 15))
+    bag.add('/rtest/temperature', temperature('oil', 21.0, START + 10))
+    # Another driver's topic, the same sensor.
+    bag.add('/hall/temperature', temperature('oil', 22.0, START + 30))
+    for sensor, value, stamp in (
+        ('', 20.0, START), ('a/b', 20.0, START), ('oil', np.nan, START), ('oil', 20.0, 0),
+    ):
+        bag.add('/rtest/temperature', temperature(sensor, value, stamp))
+    warnings = []
+    found = temperatures(read_bag(bag.close(), READ), warnings)
+    assert set(found) == {'oil', 'bed'}
+    stamps, values = found['oil']
+    assert (stamps - START).tolist() == [10, 20, 30] and values.tolist() == [21.0, 21.5, 22.0]
+    (text,) = warnings
+    assert text.startswith('/rtest/temperature: 4 messages left out (Temperature.header.frame_id')
+
+
+def test_a_recording_without_temperatures_has_none(tmp_path):
+    warnings = []
+    assert temperatures(read_bag(make_session(tmp_path / 's.mcap').path, READ), warnings) == {}
+    assert warnings == []

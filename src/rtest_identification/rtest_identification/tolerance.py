@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,8 @@ from typing import Any
 import yaml
 
 from rtest_estimation.errors import UserError
-from rtest_identification.symbols import ErrorParameter
+from rtest_identification.machine import Machine
+from rtest_identification.symbols import ErrorParameter, location_parameters, map_parameters
 
 # Suffix of a key, and what it is in SI.
 UNITS = {'um': 1e-6, 'urad': 1e-6, 'arcsec': math.radians(1.0 / 3600.0)}
@@ -72,35 +73,43 @@ class Tolerances:
                 return found
         return ()
 
-    def check(
-        self,
-        constants: Sequence[ErrorParameter],
-        maps: Sequence[ErrorParameter],
-        rotary: Iterable[str],
-    ) -> None:
-        """Whether every key means something on a machine with these errors.
+    def check(self, machine: Machine) -> None:
+        """Whether every limit can be of an error of this machine.
 
-        Raises UserError naming file, key and the nearest symbols.
+        Raises UserError naming file, key and what is expected, or the nearest symbols.
         """
-        groups = {*CONSTANT_GROUPS, MAP_GROUP, *(f'{MAP_GROUP}_{axis}' for axis in rotary)}
-        symbols = {p.symbol: p for p in (*constants, *maps)}
+        constants = location_parameters(machine)
+        maps = [p for axis in machine.rotary for p in map_parameters(machine, axis)]
+        turning, square = CONSTANT_GROUPS
+        groups = {
+            turning: [p for p in constants if p.axis in machine.rotary],
+            square: [p for p in constants if p.axis not in machine.rotary],
+            MAP_GROUP: maps,
+        }
+        groups |= {f'{MAP_GROUP}_{n}': [p for p in maps if p.axis == n] for n in machine.rotary}
+        symbols = {p.symbol: [p] for p in (*constants, *maps)}
         varying = {p.symbol for p in maps}
+        known = {**symbols, **groups}
         for key, entry in self.entries.items():
             where = f'{self.path}: {key}'
-            if key in groups or key in (RESIDUAL, VOLUMETRIC):
+            if key in (RESIDUAL, VOLUMETRIC):
                 continue
-            if key not in symbols:
-                known = [*symbols, *sorted(groups), RESIDUAL, VOLUMETRIC]
-                near = difflib.get_close_matches(key, known, n=3, cutoff=0.0)
+            if key not in known:
+                names = [*known, RESIDUAL, VOLUMETRIC]
+                near = difflib.get_close_matches(key, names, n=3, cutoff=0.0)
                 raise UserError(
                     f'{where}: this machine has no such error or group; nearest: '
                     f'{", ".join(near)}'
                 )
             for limits in entry:
-                if limits.angular is not symbols[key].angular:
-                    expected = '_urad or _arcsec' if symbols[key].angular else '_um'
-                    raise UserError(f'{where}: _{limits.unit}: expected a limit in {expected}')
-                if (limits.quantity == VALUE) is (key in varying):
+                if all(p.angular is not limits.angular for p in known[key]):
+                    kind, unit = ('angles', '_um') if limits.angular else (
+                        'lengths', '_urad or _arcsec'
+                    )
+                    raise UserError(
+                        f'{where}: _{limits.unit} is for {kind}; expected a limit in {unit}'
+                    )
+                if key in symbols and (limits.quantity == VALUE) is (key in varying):
                     raise UserError(f'{where}: expected {_expected(key in varying)}')
 
 

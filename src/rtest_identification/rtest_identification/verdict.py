@@ -22,7 +22,7 @@ from rtest_identification.field_maps import AxisNodes, GridNodes
 from rtest_identification.interpolation import TURN, Stations
 from rtest_identification.intrinsic import left_open_by_any
 from rtest_identification.pipeline import Identification
-from rtest_identification.symbols import location_parameters, map_parameters
+from rtest_identification.symbols import map_parameters
 from rtest_identification.tolerance import (
     LARGEST,
     PEAK,
@@ -98,11 +98,9 @@ def decide(limits: Limits, low: float, high: float) -> str:
 def judge(result: Identification, tolerances: Tolerances) -> Verdict:
     """Judge an identification by a tolerance file.
 
-    Raises UserError where the file names what the machine does not have.
+    Raises UserError where a limit of the file can be of no error of the machine.
     """
-    machine = result.machine
-    maps = [p for axis in machine.rotary for p in map_parameters(machine, axis)]
-    tolerances.check(location_parameters(machine), maps, machine.rotary)
+    tolerances.check(result.machine)
     found = [*_constants(result, tolerances), *_maps(result, tolerances)]
     for limits in tolerances.entries.get(RESIDUAL, ()):
         rms, freedom = result.fit.rms, result.location.freedom
