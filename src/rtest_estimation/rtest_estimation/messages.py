@@ -78,7 +78,7 @@ def feedback(message: Any) -> Feedback:
 def temperature(message: Any) -> Temperature:
     """`sensor_msgs/Temperature` to a `Temperature`; its frame names the sensor.
 
-    Raises MessageError where the frame is no name that a formula could use, or the value no number.
+    Raises MessageError where the frame is no name for a formula or the value no number.
     """
     sensor, value = str(message.header.frame_id), float(message.temperature)
     if not (sensor.isascii() and sensor.isidentifier()):

@@ -7,13 +7,15 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 
+from rtest_estimation.bagfile import Bag, read_bag
 from rtest_estimation.errors import UserError
 from rtest_estimation.missing import grouped
 from rtest_estimation.pipeline import EstimationRules, Estimator, Finished
-from rtest_estimation.recording import Recording, read_recording
+from rtest_estimation.recording import TYPES, Recording, recorded_machine, recording_of
 from rtest_identification.gap.model_file import load_model, model_columns
-from rtest_identification.machine import load_machine, parse_machine
+from rtest_identification.machine import Machine, load_machine, parse_machine
 from rtest_identification.pipeline import Identification, identify
+from rtest_identification.tolerance import Tolerances
 from rtest_identification.uncertainty import load_priors
 
 
@@ -57,6 +59,21 @@ def lost_cycles(finished: Iterable[Finished]) -> list[str]:
     return lines
 
 
+def machine_of(
+    bag: Bag, path: Path | str | None = None, topics: Mapping[str, str] | None = None
+) -> Machine:
+    """The machine of a recording, or that of another file.
+
+    Raises UserError where there is none, and naming key and what is expected.
+    """
+    if path is not None:
+        return load_machine(path)
+    text = recorded_machine(bag, topics)
+    if text is None:
+        raise UserError(f'{bag.path}: no machine was recorded; give its file with --machine')
+    return parse_machine(text, f'{bag.path}: /rtest/machine')
+
+
 def identify_recording(
     path: Path | str,
     machine_path: Path | str | None = None,
@@ -64,30 +81,29 @@ def identify_recording(
     topics: Mapping[str, str] | None = None,
     priors_path: Path | str | None = None,
     model_path: Path | str | None = None,
+    tolerances: Tolerances | None = None,
 ) -> Identification:
     """Identify the machine from a recording alone.
+
+    The files are checked before the readings are looked at, which takes longest.
 
     machine_path : another machine file than the recorded one
     topics : role to topic name, as in `rtest_estimation.recording.read_recording`
     priors_path : file of what is known of the linear axes' error motions
     model_path : file of a model whose effects are free besides
+    tolerances : by which the machine is to be judged afterwards
 
     Raises UserError naming file and what is expected.
     """
-    recording = read_recording(path, topics)
-    if machine_path is not None:
-        machine = load_machine(machine_path)
-    elif recording.machine_text is not None:
-        machine = parse_machine(recording.machine_text, f'{path}: /rtest/machine')
-    else:
-        raise UserError(f'{path}: no machine was recorded; give its file with --machine')
-    priors = load_priors(priors_path, machine) if priors_path is not None else None
     model = load_model(model_path) if model_path is not None else None
-    if model and model.machine and model.machine != machine.name:
-        raise UserError(
-            f'{model_path}: a model of machine {model.machine!r}, the recording is of '
-            f'{machine.name!r}; give the model of this machine'
-        )
+    bag = read_bag(path, TYPES)
+    machine = machine_of(bag, machine_path, topics)
+    priors = load_priors(priors_path, machine) if priors_path is not None else None
+    if model:
+        model.check(machine)
+    if tolerances:
+        tolerances.check(machine)
+    recording = recording_of(bag, topics)
     finished = estimate_recording(recording, None, progress)
     directions = {f.nest.setup: f.nest.direction for f in finished if f.nest is not None}
     effects = model_columns(model, recording.plans[0].stamp, directions) if model else None

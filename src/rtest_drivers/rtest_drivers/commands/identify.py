@@ -112,7 +112,7 @@ def identify(
     name = recording_name(bag)
     result = identify_recording(
         bag, options.machine, lambda line: quiet or print(f'  {line}', flush=True),
-        options.topics, options.priors, options.model,
+        options.topics, options.priors, options.model, limits,
     )
     for line in _missing(result):
         print(f'  missing: {line}')

@@ -13,9 +13,12 @@ import numpy as np
 import yaml
 
 from rtest_estimation.errors import UserError
+from rtest_identification.gap.catalogue import every_effect
 from rtest_identification.gap.effects import Effect, library
 from rtest_identification.gap.scene import Scene
+from rtest_identification.machine import Machine
 from rtest_identification.observations import Observations
+from rtest_identification.symbols import ErrorParameter, location_parameters
 
 _KEYS = {'name', 'machine', 'values', 'effects'}
 _EFFECT_KEYS = {'key', 'parameters', 'shape', 'confidence', 'rivals', 'provenance'}
@@ -58,6 +61,34 @@ class Model:
     machine: str
     values: dict[str, Value] = field(default_factory=dict)
     effects: tuple[ModelEffect, ...] = ()
+
+    def check(self, machine: Machine, more: Sequence[Effect] = ()) -> None:
+        """Whether it can be a model of this machine.
+
+        more : effects of the user's own
+
+        Raises UserError naming model, key and what is expected.
+        """
+        if self.machine and self.machine != machine.name:
+            raise UserError(
+                f'model {self.name!r} is of machine {self.machine!r}, the recording of '
+                f'{machine.name!r}; give the model of this machine'
+            )
+        self.resolve([*every_effect(machine), *more])
+
+    def free(self, machine: Machine) -> tuple[ErrorParameter, ...]:
+        """Location and squareness errors that it frees: those it lists, all where it lists none.
+
+        Raises UserError where it lists one that the machine does not have.
+        """
+        known = {p.symbol: p for p in location_parameters(machine)}
+        for symbol in self.values:
+            if symbol not in known:
+                raise UserError(
+                    f'model {self.name!r}: values: {symbol} is no free error of this machine; '
+                    f'it has {", ".join(known)}'
+                )
+        return tuple(p for s, p in known.items() if s in self.values or not self.values)
 
     def resolve(self, library: Sequence[Effect]) -> list[tuple[Effect, tuple[float, ...]]]:
         """The model's effects with their shape, from a library.
@@ -147,7 +178,8 @@ def save_model(model: Model, path: Path) -> None:
     }
     path.parent.mkdir(parents=True, exist_ok=True)
     text = yaml.safe_dump(data, sort_keys=False, allow_unicode=True)
-    path.write_text(f'# SI units. Free when used again: the values and the effects.\n{text}')
+    head = '# SI units. Free when used again: the values and the effects.\n'
+    path.write_text(head + text, encoding='utf-8')
 
 
 def _plain(value: Value) -> dict[str, Any]:

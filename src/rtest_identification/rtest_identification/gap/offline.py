@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from rtest_estimation.errors import UserError
-from rtest_estimation.recording import read_recording
+from rtest_estimation.bagfile import read_bag
+from rtest_estimation.recording import TYPES, recording_of, temperatures
 from rtest_estimation.records import Cycle
 from rtest_identification.gap.effects import Effect, library
 from rtest_identification.gap.model_file import Model, ModelEffect, Value
@@ -18,9 +18,9 @@ from rtest_identification.gap.rows import nest_spread
 from rtest_identification.gap.size import Found
 from rtest_identification.gap.user_effects import confusions, load_effects
 from rtest_identification.gap.workflow import GapResult, analyse
-from rtest_identification.machine import Machine, load_machine, parse_machine
+from rtest_identification.machine import Machine
 from rtest_identification.observations import stack
-from rtest_identification.offline import estimate_recording
+from rtest_identification.offline import estimate_recording, machine_of
 from rtest_identification.pipeline import refuse_other_machine
 
 
@@ -47,19 +47,22 @@ def gap_recording(
 ) -> SessionGap:
     """Run the workflow on a recording alone.
 
+    The files are checked before the readings are looked at, which takes longest.
+
     model : what is known of the machine; effects_path : the user's own effects
     machine_path : another machine file than the recorded one
 
     Raises UserError naming file and what is expected.
     """
-    recording = read_recording(path)
-    if machine_path is not None:
-        machine = load_machine(machine_path)
-    elif recording.machine_text is not None:
-        machine = parse_machine(recording.machine_text, f'{path}: /rtest/machine')
-    else:
-        raise UserError(f'{path}: no machine was recorded; give its file with --machine')
-    more = load_effects(effects_path, machine) if effects_path is not None else []
+    bag = read_bag(path, TYPES)
+    machine = machine_of(bag, machine_path)
+    more, warnings = [], []
+    if effects_path is not None:
+        more = load_effects(effects_path, machine, temperatures(bag, warnings))
+    if model:
+        model.check(machine, more)
+        model.free(machine)
+    recording = recording_of(bag)
     finished = estimate_recording(recording, None, progress)
     directions = {f.nest.setup: f.nest.direction for f in finished if f.nest is not None}
     progress('comparing model and measurement')
@@ -70,7 +73,9 @@ def gap_recording(
         if found:
             names = ', '.join(f'{key} ({cosine:.3f})' for key, cosine in found)
             alike.append(f'{effect.key} looks like {names} in these data (cosine)')
-    return replace(session, warnings=recording.warnings, confusions=tuple(alike))
+    return replace(
+        session, warnings=(*recording.warnings, *warnings), confusions=tuple(alike)
+    )
 
 
 def gap_session(
@@ -81,11 +86,8 @@ def gap_session(
     more: Sequence[Effect] = (),
 ) -> SessionGap:
     """Run the workflow on the finished cycles of a session: for command and node alike."""
-    if model and model.machine and model.machine != machine.name:
-        raise UserError(
-            f'model {model.name!r} is of machine {model.machine!r}, the recording of '
-            f'{machine.name!r}; give the model of this machine'
-        )
+    if model:
+        model.check(machine, more)
     cycles = sorted(cycles, key=lambda c: (c.plan.stamp, c.plan.cycle))
     observations = stack(machine, cycles)
     start = min(cycle.plan.stamp for cycle in cycles)
@@ -132,8 +134,8 @@ def _entry(found: Found, result: GapResult, session: str, when: str) -> ModelEff
     ]
     gap = result.gap
     why = (
-        f'{found.effect.name}: gap {gap.before * 1e6:.2f} to {gap.after * 1e6:.2f} um, noise '
-        f'{gap.noise * 1e6:.2f} um'
+        f'{found.effect.name}: gap {gap.before * 1e6:.2f} to {gap.after * 1e6:.2f} µm, noise '
+        f'{gap.noise * 1e6:.2f} µm'
     )
     return ModelEffect(
         found.effect.key,

@@ -12,6 +12,9 @@ from rtest_identification.gap.size import Found
 from rtest_identification.gap.where import Place
 from rtest_identification.gap.workflow import GapResult
 
+# Above this many times the noise on held-out poses the report says so.
+HELD_OUT_LIMIT = 1.1
+
 
 def as_dict(session: str, result: GapResult, model: str | None = None) -> dict[str, Any]:
     """The result as JSON data; SI units, numbers unrounded. model : file it was written to."""
@@ -33,6 +36,8 @@ def as_dict(session: str, result: GapResult, model: str | None = None) -> dict[s
             'heldout_after': _number(gap.heldout_after),
             'heldout_noise': _number(gap.heldout_noise),
         },
+        'noise_correlation': result.rows.correlation,
+        'left_out': [{'cycle': cycle, 'pose': pose} for cycle, pose in result.odd],
         'probability': result.probability,
         'rest_probability': result.rest_probability,
         'model': model,
@@ -61,6 +66,8 @@ def _effect(found: Found) -> dict[str, Any]:
         'parameters': dict(zip(names, found.value.tolist(), strict=True)),
         'stddev': {n: _number(s) for n, s in zip(names, found.stddev.tolist(), strict=True)},
         'units': dict(zip(names, units, strict=True)),
+        'signal_to_noise': found.strength,
+        'seen_rms': found.seen,
         'confidence': found.confidence,
         'rivals': list(found.rivals),
         'separate_by': found.separate_by,
@@ -86,19 +93,41 @@ def lines(result: GapResult) -> list[str]:
     """What a person wants to know of each effect, and where an unexplained gap sits."""
     told = []
     for found in result.found:
+        numbers = list(zip(
+            (*found.effect.parameters, *found.effect.shape), found.value, found.stddev,
+            strict=True,
+        ))
         sizes = ', '.join(
-            f'{p.name} = {v:.3g} ± {2 * s:.2g} {p.unit}'
-            if math.isfinite(s) else f'{p.name} open in these data'
-            for p, v, s in zip(
-                (*found.effect.parameters, *found.effect.shape), found.value, found.stddev,
-                strict=True,
-            )
+            f'{p.name} = {v:.3g} ± {2 * s:.2g} {p.unit}' for p, v, s in numbers if math.isfinite(s)
         )
         told.append(f'{found.effect.key}: {found.effect.name}; {found.effect.formula}')
-        told.append(f'  {sizes} (k = 2), confidence {found.confidence:.2f}')
+        if sizes:
+            told.append(f'  {sizes} (k = 2)')
+        left = [p.name for p, _, s in numbers if not math.isfinite(s)]
+        if left:
+            told.append(f'  these data show {", ".join(left)} only together, not each')
+        told.append(
+            f'  moves the sphere by {found.seen * 1e6:.2f} µm rms beyond what the constants can, '
+            f'{found.strength:.0f} standard deviations; confidence {found.confidence:.2f}'
+        )
         if found.rivals:
             told.append(f'  could also be {", ".join(found.rivals)}')
             told.append(f'  to tell them apart: {found.separate_by}')
+    if result.odd:
+        poses = ', '.join(f'{cycle} {pose}' for cycle, pose in result.odd[:5])
+        more = f' and {len(result.odd) - 5} more' if len(result.odd) > 5 else ''
+        told.append(f'left out, far from what the same pose shows elsewhere: {poses}{more}')
+    if result.rows.correlation:
+        told.append(
+            f'noise goes on from pose to pose (correlation {result.rows.correlation:.2f}); '
+            'allowed for'
+        )
+    held, noise = result.gap.heldout_after, result.gap.heldout_noise
+    if result.verdict == 'explained' and held > HELD_OUT_LIMIT * noise:
+        told.append(
+            f'poses held out keep {held * 1e6:.2f} µm where their noise is {noise * 1e6:.2f} µm: '
+            'between the levels the model is less sure than at them'
+        )
     if result.verdict in ('unknown effect', 'partly explained'):
         for place in result.where[:5]:
             told.append(f'unexplained at {where(place)}: rms {place.rms * 1e6:.2f} µm')

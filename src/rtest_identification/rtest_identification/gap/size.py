@@ -23,7 +23,10 @@ Chosen = tuple[Effect, tuple[float, ...]]
 class Found:
     """An effect that was added, with its size.
 
-    value, stddev : of `effect.parameters`, then of its shape
+    value, stddev : of `effect.parameters`, then of its shape; where the data show a parameter only
+        together with others stddev is infinite and value a part of it
+    strength : signal to noise, the norm of what the base model leaves of it in standard deviations
+    seen : rms of that over all poses and directions [m]
     separate_by : the measurement that would tell it from its rivals
     """
 
@@ -31,6 +34,8 @@ class Found:
     shape: tuple[float, ...]
     value: np.ndarray
     stddev: np.ndarray
+    strength: float
+    seen: float
     confidence: float
     rivals: tuple[str, ...]
     separate_by: str
@@ -59,13 +64,18 @@ def sizes(
             variance = variance + (0.5 * (high - low)) ** 2
     stddev = np.sqrt(variance)
     found, column = [], 0
+    base = _base(rows)
+    rms = float(np.sqrt(np.mean(rows.sigma**2) / rows.residual.size))
     for (effect, shape), width, name in zip(chosen, spread, named, strict=True):
         part = slice(column, column + len(effect.parameters))
         column = part.stop
+        whole = rows.white(effect.columns(rows.scene, shape) @ value[part])
+        strength = float(np.linalg.norm(whole - base @ (base.T @ whole)))
         found.append(
             Found(
                 effect, shape, np.append(value[part], shape),
-                np.append(stddev[part], [width] * len(shape)), name.confidence, name.rivals,
+                np.append(stddev[part], [width] * len(shape)), strength, strength * rms,
+                name.confidence, name.rivals,
                 separate(rows, effect, name.rivals, more),
             )
         )
@@ -80,11 +90,7 @@ def visible(
     Combinations of parameters that the base model can take over are not in the data: they are set
     to zero, so that a size is stated only for what is seen.
     """
-    base = rows.white(rows.base)
-    u, s, _ = np.linalg.svd(
-        base / np.maximum(np.linalg.norm(base, axis=0), 1e-300), full_matrices=False
-    )
-    u = u[:, s > 1e-6 * s[0]]
+    u = _base(rows)
     y = rows.white(rows.residual)
     y = y - u @ (u.T @ y)
     columns = rows.white(np.concatenate([e.columns(rows.scene, s) for e, s in chosen], axis=2))
@@ -100,6 +106,15 @@ def visible(
     open_ones = (wt[~good] ** 2).sum(axis=0) > _HIDDEN_SHARE**2
     cofactor[open_ones, open_ones] = np.inf
     return value / norm, cofactor, rest
+
+
+def _base(rows: Rows) -> np.ndarray:
+    """(3 n, r) orthonormal: what the base model can do."""
+    base = rows.white(rows.base)
+    u, s, _ = np.linalg.svd(
+        base / np.maximum(np.linalg.norm(base, axis=0), 1e-300), full_matrices=False
+    )
+    return u[:, s > 1e-6 * s[0]]
 
 
 def _spread(rows: Rows, chosen: Sequence[Chosen]) -> list[float]:
