@@ -1,0 +1,91 @@
+"""The language of linuxcncrsh: text in, values out (man page linuxcncrsh(1)).
+
+A request is a line, a reply is a line. Replies to `get` end in CR LF, those to `set` in LF CR, and
+a refused `get` ends in an empty line more.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+import numpy as np
+
+# No reply is as long; the server writes from a buffer of this size.
+LONGEST = 4096
+_NUMBER = re.compile(r'-?\d+\.\d+')
+# What `get joint_units` says of a joint, as units of the device file.
+UNIT_WORDS = {'MM': 'mm', 'INCH': 'inch', 'DEG': 'deg', 'RAD': 'rad'}
+
+
+class ReplyError(ConnectionError):
+    """A reply that is no answer to what was asked."""
+
+
+class Refused(ReplyError):
+    """The server says NAK."""
+
+
+def take_line(buffer: bytearray) -> str | None:
+    """Take the first line out of what was received; None where no line has ended yet."""
+    while buffer[:1] in (b'\r', b'\n'):
+        del buffer[0]
+    ends = [at for at in (buffer.find(b'\r'), buffer.find(b'\n')) if at >= 0]
+    if not ends:
+        if len(buffer) > LONGEST:
+            raise ReplyError(f'{len(buffer)} bytes without an end of line; is it linuxcncrsh?')
+        return None
+    line = buffer[: min(ends)].decode('utf-8', 'replace')
+    del buffer[: min(ends)]
+    return line
+
+
+def answer(request: str, reply: str) -> str:
+    """What a reply to `get WORD` or `set WORD ...` says after the word.
+
+    Raises Refused where it is NAK, ReplyError where it answers something else.
+    """
+    verb, word = request.upper().split()[:2]
+    start = f'{verb} {word} ' if verb == 'SET' else f'{word} '
+    if reply in (f'{verb} {word} NAK', f'{verb} NAK'):
+        raise Refused(f'{request!r} was refused')
+    if not reply.startswith(start):
+        raise ReplyError(f'{request!r} was answered by {reply[:60]!r}')
+    return reply[len(start) :]
+
+
+def positions(request: str, reply: str) -> np.ndarray:
+    """(joints,) positions; raises ReplyError where one of them is no number."""
+    words = answer(request, reply).split()
+    if not words or not all(map(_NUMBER.fullmatch, words)):
+        raise ReplyError(f'{request!r} was answered by {reply[:60]!r}')
+    return np.array(words, dtype=float)
+
+
+@dataclass(frozen=True)
+class State:
+    """What the controller says of itself.
+
+    homed : one a joint; program : IDLE, RUNNING or PAUSED; line : of the program
+    """
+
+    estop: bool
+    machine_on: bool
+    homed: tuple[bool, ...]
+    program: str
+    line: str
+
+
+# Asked for one after the other.
+STATE_REQUESTS = (
+    'get estop', 'get machine', 'get joint_homed', 'get program_status', 'get program_line',
+)
+
+
+def state(replies: list[str]) -> State:
+    """The replies to `STATE_REQUESTS`."""
+    estop, machine, homed, program, line = map(answer, STATE_REQUESTS, replies)
+    return State(
+        estop == 'ON', machine == 'ON', tuple(word == 'YES' for word in homed.split()), program,
+        line,
+    )
