@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from rtest_identification.gap.projection import Candidate, Projection
 
 # Probability of taking the best of all candidates for real where there is nothing.
-FALSE_ALARM = 0.003
+FALSE_ALARM = 0.004
 # The same for every further effect.
 FURTHER_ALARM = 0.001
 # Candidates less than 100 times less likely are rivals.
@@ -52,6 +52,11 @@ class Search:
     freedom: int
     null: np.ndarray
 
+    def without_names(self) -> Search:
+        """The same rows with nothing named in them."""
+        freedom = self.freedom + sum(n.candidate.count for n in self.named)
+        return replace(self, named=(), after=self.before, freedom=freedom)
+
 
 def search(projection: Projection, null: np.ndarray | None = None) -> Search:
     """Singles and pairs first, then grow, swap and drop while the criterion falls.
@@ -68,7 +73,12 @@ def search(projection: Projection, null: np.ndarray | None = None) -> Search:
         return _result(projection, [], probability, null)
     limit = null[int(FURTHER_ALARM * len(null))]
     singles = sorted(everyone, key=lambda i: projection.criterion([i]))
-    sets = [[singles[0]]]
+    # The best of each effect, with its best shape: between two of a grid it may look worse than
+    # what only resembles it.
+    leaders: dict[str, int] = {}
+    for i in singles[:_FIRST]:
+        leaders.setdefault(candidates[i].effect.key, i)
+    sets = [[projection.refine([i], 0)] for i in leaders.values()]
     for first in singles[:_FIRST]:
         others = (i for i in everyone if candidates[i].effect.key != candidates[first].effect.key)
         second = min(others, key=lambda i, f=first: projection.criterion([f, i]))

@@ -30,6 +30,8 @@ EXPLAINED_SHARE = 0.5
 REST_ALARM = 0.0005
 # A name this unsure in the presence of an unexplained rest is no name.
 SURE = 0.9
+# Something is there, though no name holds, when chance does as much in so few sessions.
+SURELY_SOMETHING = 0.001
 # By how much, in chi-squared, what was named may fit the held-out poses worse than nothing: a true
 # effect does by chance, in three of a thousand sessions in which it is six standard deviations.
 HELD_OUT_CHANCE = 9.0
@@ -135,7 +137,9 @@ def analyse(
     held = hold_out(rows, effects, first.null)
     if named and held.worse > HELD_OUT_CHANCE:
         # What makes poses that took no part worse is not there, whatever it does to the others.
-        named, verdict = (), 'unknown effect'
+        named, (_, verdict, rest) = (), _judge(rows, first.without_names(), ())
+        if first.probability <= SURELY_SOMETHING:
+            verdict = 'unknown effect'
     found = sizes(rows, named, chosen, more)
     after = model_rows([(f.effect, f.shape) for f in found])
     gap = Gap(
