@@ -159,13 +159,37 @@ def cycle(message: Any) -> Cycle:
 
 
 def nest_calibration(message: Any, setup: str = '') -> NestCalibration:
-    """`rtest_msgs/NestCalibration` to a `NestCalibration`."""
+    """`rtest_msgs/NestCalibration` to a `NestCalibration`.
+
+    The readings at the initial position are not in the message: what is read from one holds for
+    readings relative to those.
+
+    Raises MessageError where the array sizes do not fit each other.
+    """
+    names = ('direction', 'spot', 'correction_nodes', 'correction_values')
+    arrays = {name: np.array(getattr(message, name), dtype=float) for name in names}
+    sizes = {name: array.size for name, array in arrays.items()}
+    kind = NestKind(int(message.kind))
+    if (
+        any(size % 3 for size in sizes.values())
+        or sizes['correction_nodes'] != sizes['correction_values']
+        or sizes['spot'] not in ((sizes['direction'],) if kind is NestKind.LASER else (0,))
+    ):
+        raise MessageError(
+            f'NestCalibration {message.calibration!r}: '
+            + ', '.join(f'{name} has {size} values' for name, size in sizes.items())
+            + '; expected three for each gauge or node, and a spot for each laser'
+        )
+    direction, spot, nodes, values = (array.reshape(-1, 3) for array in arrays.values())
     return NestCalibration(
         str(message.calibration),
         setup,
         nanoseconds(message.header.stamp),
-        np.array(message.direction, dtype=float).reshape(-1, 3),
+        direction,
         float(message.residual),
         float(message.sphere_radius),
-        NestKind(int(message.kind)),
+        kind,
+        spot=spot,
+        correction_nodes=nodes,
+        correction_values=values,
     )

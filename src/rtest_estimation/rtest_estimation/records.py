@@ -164,7 +164,11 @@ class NestCalibration:
     zero : (gauges,) readings with the sphere at its initial position [m]
     gain : (gauges,) length of each direction before it was made a unit vector
     gain_stddev : (gauges,) standard uncertainty of the gain
-    condition : condition number of the directions
+    condition : condition number of the directions; LASER: of the surface normals at the spots
+    spot : LASER: (gauges, 3) where each beam meets the sphere at its initial position, relative
+        to the sphere centre there [m]; P_i0 of Eq. 5-2
+    correction_nodes : LASER: (n, 3) estimated centres at the calibration positions [m]
+    correction_values : LASER: (n, 3) what to add to an estimate there [m] (Eq. 5-5)
     """
 
     calibration: str
@@ -179,3 +183,6 @@ class NestCalibration:
     gain: np.ndarray = field(default_factory=lambda: np.empty(0))
     gain_stddev: np.ndarray = field(default_factory=lambda: np.empty(0))
     condition: float = float('nan')
+    spot: np.ndarray = field(default_factory=lambda: np.empty((0, 3)))
+    correction_nodes: np.ndarray = field(default_factory=lambda: np.empty((0, 3)))
+    correction_values: np.ndarray = field(default_factory=lambda: np.empty((0, 3)))

@@ -130,7 +130,10 @@ class EstimatorNode(Node):
         line = 'waiting for a plan'
         if progress is not None:
             plan, done = progress
-            values |= {'cycle': plan.cycle, 'poses_done': done, 'poses': len(plan.commands)}
+            values |= {
+                'cycle': plan.cycle, 'started': plan.stamp, 'poses_done': done,
+                'poses': len(plan.commands),
+            }
             line = f'{plan.cycle}: {done} of {len(plan.commands)} poses'
         level = diagnostics.OK
         if lost := self._sequence.lost - self._lost_before:
