@@ -1,10 +1,13 @@
-"""Time of an identification beside a plain least-squares script, in one run.
+"""Time of an identification and of its error table beside plain scripts, in one run.
 
     python bench/identify.py
 
 4 x 84 poses: location errors, squareness, both maps, uncertainty budget (`identify`), against
 `scipy.linalg.lstsq` on the location errors alone with the Jacobian given, and on the same with a
 Jacobian from finite differences, as a script would do it.
+
+Then the predicted error with its covariance at 500 poses from the identified maps (`ErrorField`),
+all poses at once against one pose after the other.
 """
 
 from __future__ import annotations
@@ -21,6 +24,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / 'src/rtest_identifi
 
 from independent import NMV, SETUPS, nest_cycle, noisy, static_cycle
 
+from rtest_identification.error_field import ErrorField
 from rtest_identification.kinematics import predict
 from rtest_identification.machine import parse_machine
 from rtest_identification.observations import stack
@@ -28,11 +32,12 @@ from rtest_identification.pipeline import identify
 from rtest_identification.symbols import location_parameters
 
 _REPEATS = 9
+_POSES = 500
 
 
-def _median(function: Callable[[], object]) -> float:
+def _median(function: Callable[[], object], repeats: int = _REPEATS) -> float:
     times = []
-    for _ in range(_REPEATS):
+    for _ in range(repeats):
         begin = time.perf_counter()
         function()
         times.append(time.perf_counter() - begin)
@@ -74,7 +79,15 @@ def main() -> None:
         ('the same, Jacobian by finite differences', scripted),
         ('identify: errors, both maps, budget', whole),
     ):
-        print(f'{name:44}{value:8.3f}{value / plain:8.1f}')
+        print(f'{name:44}{value:8.4f}{value / plain:8.1f}')
+    field = ErrorField.from_identification(identify(machine, cycles), every_map=True)
+    rotary = np.column_stack([rng.uniform(-1.3, 1.3, _POSES), rng.uniform(0.0, 6.0, _POSES)])
+    rows = np.column_stack([rng.uniform(-0.1, 0.1, (_POSES, 3)), rotary])
+    zero = [0.0, 0.0]
+    together = _median(lambda: field.at(rows, zero))
+    singly = _median(lambda: [field.at(row, zero) for row in rows], 1)
+    print(f'{f"error table, {_POSES} poses at once":44}{together:8.4f}{1.0:8.1f}')
+    print(f'{"the same, one pose after the other":44}{singly:8.4f}{singly / together:8.1f}')
 
 
 if __name__ == '__main__':

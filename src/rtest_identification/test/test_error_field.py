@@ -1,7 +1,6 @@
 """Predicted errors anywhere, against a machine of plain matrices that shares no code."""
 
 import json
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -328,12 +327,3 @@ def test_the_tool_of_a_head_machine_may_be_another():
         machine.chain, named, {}, tool
     )
     np.testing.assert_allclose(field.at(row).error[0], want, atol=0.2e-6)
-
-
-def test_ten_thousand_poses_take_well_under_a_second():
-    field = ErrorField.from_identification(IDENTIFIED, every_map=True)
-    rng = np.random.default_rng(9)
-    positions = poses(MACHINE, rng.uniform(B[0], B[-1], 10_000), rng.uniform(0, 6, 10_000))
-    start = time.perf_counter()
-    field.at(positions, reference=[0.0, 0.0])
-    assert time.perf_counter() - start < 1.0

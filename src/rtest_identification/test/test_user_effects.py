@@ -9,6 +9,7 @@ import pytest
 from independent import NMV, SETUPS, noisy, static_cycle
 
 from rtest_estimation.errors import UserError
+from rtest_identification.gap.confusions import confusions
 from rtest_identification.gap.effects import library
 from rtest_identification.gap.formula import parse_formula
 from rtest_identification.gap.model_file import (
@@ -20,7 +21,7 @@ from rtest_identification.gap.model_file import (
 )
 from rtest_identification.gap.rows import make_rows
 from rtest_identification.gap.units import to_si
-from rtest_identification.gap.user_effects import RESERVED, confusions, load_effects
+from rtest_identification.gap.user_effects import RESERVED, load_effects
 from rtest_identification.gap.workflow import analyse
 from rtest_identification.machine import parse_machine
 from rtest_identification.observations import stack
@@ -185,6 +186,31 @@ def test_what_is_no_unit(text):
 def test_what_is_not_linear_is_told(tmp_path, formula, what):
     message = refused(tmp_path, one(formula))
     assert what in message and f"mine/C: E_XC = '{formula}'" in message
+
+
+@pytest.mark.parametrize('formula', [
+    '0*p', 'p*(C - C)', 'p - p', 'p*C - C*p', 'p*X*0*d1', 'p*(abs(sign(B)) - sign(B)**2)',
+    'p*(abs(B) + B)*(abs(B) - B)',
+])
+def test_a_parameter_that_changes_nothing_is_refused(tmp_path, formula):
+    assert 'mine/C: p: its factor in the formulas is always 0' in refused(tmp_path, one(formula))
+
+
+def test_each_parameter_must_change_one_of_the_formulas(tmp_path):
+    message = refused(tmp_path, BEARING.replace('q*sin(4*C)', '0*q').replace('q*cos', '0*q*cos'))
+    assert 'my-bearing/C: q: its factor' in message
+    (effect,) = load(tmp_path, BEARING.replace('q*sin(4*C)', '0*q'))
+    assert len(effect.parameters) == 2
+
+
+@pytest.mark.parametrize('formula', [
+    # Small, short, far, seldom or not a number somewhere: no reason to refuse.
+    '1e-9*p', 'p*X**8', 'p*exp(-t/0.1)', 'p*(abs(t - 7200) + t - 7200)', 'p*d1**4', 'p*log(B)',
+    'p*exp(-((X - 0.05)/0.001)**2)', 'p*(1 - sign(B)**2)', 'p*(T.oil - 20)', 'p/(t - t)',
+])
+def test_a_parameter_that_changes_anything_is_not_refused(tmp_path, formula):
+    steady = {'oil': (np.array([0]), np.array([20.0]))}
+    assert load(tmp_path, one(formula), temperatures=steady)
 
 
 def test_what_passes_is_linear_in_numbers_too():

@@ -16,28 +16,31 @@ _FACTORS = np.array([1, 2, 5]) * 10.0 ** np.arange(3, 7)[:, None]
 
 
 def closing(result: GapResult) -> Figure:
-    """The gap before and after, on fitted and on held-out poses, against the noise."""
+    """The gap before and after, of all poses and of held-out ones, against the noise of each."""
     gap = result.gap
-    figure = Figure(figsize=(7.5, 3.6), layout='constrained')
+    figure = Figure(figsize=(7.5, 3.8), layout='constrained')
     axes = figure.subplots()
-    groups = [('poses that were fitted', gap.before, gap.after)]
+    groups = [('all poses', gap.before, gap.after, gap.noise)]
     if np.isfinite(gap.heldout_before):
         groups.append(('poses held out of naming and fitting', gap.heldout_before,
-                       gap.heldout_after))
-    for place, (_, before, after) in enumerate(groups):
+                       gap.heldout_after, gap.heldout_noise))
+    for place, (_, before, after, noise) in enumerate(groups):
+        bars = []
         for shift, value, colour in ((-0.2, before, _BEFORE), (0.2, after, _AFTER)):
-            axes.bar(place + shift, value * 1e6, 0.36, color=colour)
-            axes.annotate(f'{value * 1e6:.2f}', (place + shift, value * 1e6), ha='center',
-                          va='bottom')
-    axes.axhline(gap.noise * 1e6, color='0.25', linestyle='--')
-    axes.plot([], [], color='0.25', linestyle='--', label=f'noise, {gap.noise * 1e6:.2f} µm')
-    axes.set_xticks(range(len(groups)), [name for name, _, _ in groups])
+            bars.append(axes.bar(place + shift, value * 1e6, 0.36, color=colour))
+            # Above the line where that is just above the bar, so that it can be read.
+            axes.annotate(f'{value * 1e6:.2f}', (place + shift, max(value, noise) * 1e6), (0, 2),
+                          ha='center', va='bottom', textcoords='offset points')
+        line = axes.hlines(noise * 1e6, place - 0.44, place + 0.44, '0.1', '--')
+    axes.set_xticks(range(len(groups)), [
+        f'{name}\nnoise {noise * 1e6:.2f} µm' for name, _, _, noise in groups
+    ])
     axes.set_xlim(-0.5, len(groups) - 0.5)
-    axes.set_ylim(0.0, 1.25e6 * max(max(b, a) for _, b, a in groups))
+    axes.set_ylim(0.0, 1.25e6 * max(max(values) for _, *values in groups))
     axes.set_ylabel('rms difference [µm]')
-    axes.bar([0], [0], color=_BEFORE, label='model before')
-    axes.bar([0], [0], color=_AFTER, label='model with the effect' if result.found else 'after')
-    figure.legend(loc='outside upper center', ncols=3, frameon=False)
+    after_label = 'model with the effect' if result.found else 'after'
+    figure.legend([*bars, line], ['model before', after_label, 'noise of these poses'],
+                  loc='outside upper center', ncols=3, frameon=False)
     return figure
 
 

@@ -61,9 +61,7 @@ class Formula:
         Exact, as the formula was found linear in the parameters `linear`.
         Raises UserError where it is not a number, or no sensible one.
         """
-        units = {other: 1.0 if other == name else 0.0 for other in linear}
-        with np.errstate(all='ignore'):
-            result = np.atleast_1d(_value(self.tree, {**values, **units}))
+        result = self._per_unit(name, linear, values)
         # Not <= is also true of NaN.
         bad = ~(np.abs(result) <= LARGEST)
         if bad.any():
@@ -78,6 +76,19 @@ class Formula:
                 f'{LARGEST:.0e} at every pose'
             )
         return result
+
+    def changes_with(
+        self, name: str, linear: Collection[str], values: Mapping[str, np.ndarray | float]
+    ) -> bool:
+        """Whether the parameter `name` matters in any row of `values`; what is no number does."""
+        return bool(np.any(self._per_unit(name, linear, values) != 0.0))
+
+    def _per_unit(
+        self, name: str, linear: Collection[str], values: Mapping[str, np.ndarray | float]
+    ) -> np.ndarray:
+        units = {other: 1.0 if other == name else 0.0 for other in linear}
+        with np.errstate(all='ignore'):
+            return np.atleast_1d(_value(self.tree, {**values, **units}))
 
 
 def parse_formula(

@@ -12,11 +12,12 @@ import numpy as np
 from rtest_estimation.bagfile import read_bag
 from rtest_estimation.recording import TYPES, recording_of, temperatures
 from rtest_estimation.records import Cycle
+from rtest_identification.gap.confusions import confusions
 from rtest_identification.gap.effects import Effect, library
 from rtest_identification.gap.model_file import Model, ModelEffect, Value
 from rtest_identification.gap.rows import nest_spread
 from rtest_identification.gap.size import Found
-from rtest_identification.gap.user_effects import confusions, load_effects
+from rtest_identification.gap.user_effects import load_effects
 from rtest_identification.gap.workflow import GapResult, analyse
 from rtest_identification.machine import Machine
 from rtest_identification.observations import stack
@@ -61,7 +62,7 @@ def gap_recording(
         more = load_effects(effects_path, machine, temperatures(bag, warnings))
     if model:
         model.check(machine, more)
-        model.free(machine)
+        model.free(machine)  # Raises where it lists an error that the machine does not have.
     recording = recording_of(bag)
     finished = estimate_recording(recording, None, progress)
     directions = {f.nest.setup: f.nest.direction for f in finished if f.nest is not None}

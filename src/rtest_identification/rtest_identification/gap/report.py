@@ -14,9 +14,9 @@ if TYPE_CHECKING:
 
 _CAPTIONS = {
     'gap_closing': 'How far measurement and model are apart (rms per component), before and after '
-    'what was found was added to the model. Down to the dashed line nothing is left but noise. '
-    'Held-out poses took no part in naming or fitting: there an effect that is not real makes the '
-    'gap larger.',
+    'what was found was added to the model. Down to the dashed line nothing is left but the noise '
+    'of these poses. Held-out poses took no part in naming or fitting: there an effect that is '
+    'not real makes the gap larger.',
     'gap_over_axes': 'Residual at every pose of both rotary axes, table frame; left three columns '
     'before, right three after, one row a cycle, one colour scale for all. A pattern on the left '
     'that is gone on the right is explained.',

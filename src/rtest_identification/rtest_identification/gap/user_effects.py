@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -13,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from rtest_estimation.errors import UserError
+from rtest_identification.gap.confusions import INVISIBLE
 from rtest_identification.gap.effects import Effect, Parameter
 from rtest_identification.gap.formula import (
     CONSTANTS,
@@ -24,8 +24,6 @@ from rtest_identification.gap.formula import (
     shown,
 )
 from rtest_identification.gap.plain_yaml import read_plain
-from rtest_identification.gap.projection import Projection
-from rtest_identification.gap.rows import Rows
 from rtest_identification.gap.scene import Scene
 from rtest_identification.gap.units import EXPECTED, to_si
 from rtest_identification.machine import Machine
@@ -40,13 +38,12 @@ RESERVED = frozenset((
     'laser-incidence', 'servo-mismatch', 'clock-offset', 'friction-lag', 'radius-shrink',
     'reversal-spike',
 ))
-# An effect that looks more than this like one of the library is not told from it for certain.
-CONFUSABLE = 0.98
-# Stands for the base model in `confusions`.
-INVISIBLE = 'invisible'
 MAX_EFFECTS, MAX_PARAMETERS, MAX_SHAPE, MAX_GRID, MAX_GAUGES = 50, 12, 2, 40, 12
 # Of all effects of a file over their grids: every one takes its time in every search.
 MAX_COLUMNS = 600
+# Random rows, within these limits, on which a formula must change with each of its parameters:
+# positions [m] or [rad], powers of ten of times [s], temperatures [deg C], readings [m].
+_ROWS, _FAR, _TIMES, _WARM, _READING = 2000, 10.0, (-1.0, 5.0), (0.0, 50.0), 1e-5
 # By this part of its range a shape may lie beyond its grid; the ends are taken for it there.
 _BEYOND = 0.05
 _KEY = re.compile(r'([A-Za-z0-9][A-Za-z0-9_.-]{0,39})(/[A-Za-z0-9][A-Za-z0-9_.-]{0,39})?')
@@ -84,37 +81,6 @@ def load_effects(
             'give shorter grids'
         )
     return list(effects.values())
-
-
-def confusions(
-    effect: Effect, rows: Rows, library: Sequence[Effect]
-) -> list[tuple[str, float]]:
-    """Which effects a new one looks like in these rows, beside the base model.
-
-    The cosine of the smallest principal angle between what is left of both, over their shapes: for
-    some values of its parameters the new effect cannot be told from that one. Those above
-    CONFUSABLE, the most alike first; INVISIBLE alone, with the cosine to the base model, where
-    less than 2 % of the new effect is left.
-    """
-    projection = Projection(rows, library)
-    own = [projection.project(rows, effect, shape) for shape in effect.grid]
-    bases = [candidate.basis for candidate in own if candidate is not None]
-    if not bases:
-        columns = rows.white(np.concatenate(
-            [effect.columns(rows.scene, shape) for shape in effect.grid], axis=2
-        ))
-        left = columns - projection.base @ (projection.base.T @ columns)
-        size = np.linalg.norm(columns, axis=0)
-        share = float(np.max(np.linalg.norm(left, axis=0) / np.maximum(size, 1e-300)))
-        return [(INVISIBLE, math.sqrt(max(1.0 - share**2, 0.0)))]
-    cosines: dict[str, float] = {}
-    for candidate in projection.candidates:
-        key = candidate.effect.key
-        for basis in bases:
-            cosine = float(np.linalg.norm(basis.T @ candidate.basis, 2))
-            cosines[key] = max(cosines.get(key, 0.0), min(cosine, 1.0))
-    found = [(k, c) for k, c in cosines.items() if c > CONFUSABLE and k != effect.key]
-    return sorted(found, key=lambda pair: -pair[1])
 
 
 @dataclass(frozen=True)
@@ -224,6 +190,16 @@ def _effect(
     unused = [one for one in (*linear, *(p.name for p in shape)) if one not in used]
     if unused:
         raise UserError(f'{where}: {", ".join(unused)}: in no formula; expected a use or no entry')
+    drawn = _drawn(used, machine, dict(zip((p.name for p in shape), grids, strict=True)))
+    idle = [
+        one for one in linear
+        if not any(formula.changes_with(one, linear, drawn) for *_, formula in terms.values())
+    ]
+    if idle:
+        raise UserError(
+            f'{where}: {", ".join(idle)}: its factor in the formulas is always 0; expected '
+            'formulas that change with it or no entry'
+        )
     columns = _Columns(
         tuple(terms.values()), linear,
         tuple((p.name, min(g), max(g)) for p, g in zip(shape, grids, strict=True)),
@@ -234,6 +210,29 @@ def _effect(
         tuple(error for error, term in terms.items() if term[0]), tuple(parameters), columns,
         tuple(shape), tuple(itertools.product(*grids)),
     )
+
+
+def _drawn(
+    names: Iterable[str], machine: Machine, grids: Mapping[str, Sequence[float]]
+) -> dict[str, np.ndarray]:
+    """Random values of what formulas read besides their parameters."""
+    rng = np.random.default_rng(0)
+    values = {}
+    for name in sorted(names):
+        if name in grids:
+            values[name] = rng.choice(grids[name], _ROWS)
+        elif name in machine.axes:
+            axis = machine.axes[name]
+            values[name] = rng.uniform(max(axis.lower, -_FAR), min(axis.upper, _FAR), _ROWS)
+        elif name.startswith(f'{SIGN}('):
+            values[name] = rng.choice([-1.0, 0.0, 1.0], _ROWS)
+        elif name == 't':
+            values[name] = 10.0 ** rng.uniform(*_TIMES, _ROWS)
+        elif name.startswith(f'{TEMPERATURE}.'):
+            values[name] = rng.uniform(*_WARM, _ROWS)
+        elif _GAUGE.fullmatch(name):
+            values[name] = _READING * rng.standard_normal(_ROWS)
+    return values
 
 
 def _mapping(data: Any, where: str, known: set[str] | None = None) -> dict[str, Any]:

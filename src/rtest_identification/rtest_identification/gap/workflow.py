@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import stats
 
-from rtest_estimation.errors import UserError
 from rtest_identification.gap.effects import Effect, library, location
 from rtest_identification.gap.generic import generic_probability
 from rtest_identification.gap.held_out import hold_out
@@ -18,7 +17,6 @@ from rtest_identification.gap.rows import Rows, make_rows
 from rtest_identification.gap.search import Named, Search, search
 from rtest_identification.gap.size import Chosen, Found, sizes
 from rtest_identification.gap.where import Place, locate
-from rtest_identification.machine import Machine
 from rtest_identification.observations import Observations
 from rtest_identification.symbols import RANK_TOLERANCE, ErrorParameter, location_parameters
 
@@ -102,7 +100,8 @@ def analyse(
 
     Raises UserError where the model has an effect that the machine cannot have.
     """
-    constants = _free(observations.machine, known)
+    machine = observations.machine
+    constants = known.free(machine) if known else location_parameters(machine)
     rows = make_rows(observations, start, directions, (), constants)
     odd: list[tuple[str, int]] = []
     while rows.odd.any():
@@ -118,7 +117,7 @@ def analyse(
     effects = [*library(rows.scene), *more]
     model = known.resolve(effects) if known else []
     have = {effect.key for effect, _ in model} | set(without)
-    left_out = [p for p in location_parameters(observations.machine) if p not in constants]
+    left_out = [p for p in location_parameters(machine) if p not in constants]
     effects = [effect for effect in effects if effect.key not in have]
     effects += [location(parameter) for parameter in left_out]
     rows = model_rows()
@@ -150,24 +149,6 @@ def analyse(
         verdict, found, first.invisible, locate(rows), gap, first.probability, rest,
         _constants(after), rows, after.residual, tuple(odd),
     )
-
-
-def _free(machine: Machine, known: Model | None) -> tuple[ErrorParameter, ...]:
-    """Location and squareness errors that a model frees: those it lists, all where it lists none.
-
-    Raises UserError where it lists one that the machine does not have.
-    """
-    parameters = location_parameters(machine)
-    if known is None or not known.values:
-        return parameters
-    symbols = [p.symbol for p in parameters]
-    for symbol in known.values:
-        if symbol not in symbols:
-            raise UserError(
-                f'model {known.name!r}: values: {symbol} is no free error of this machine; '
-                f'it has {", ".join(symbols)}'
-            )
-    return tuple(p for p in parameters if p.symbol in known.values)
 
 
 def _constants(rows: Rows) -> Constants:
