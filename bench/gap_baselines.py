@@ -1,6 +1,6 @@
 """Other ways of choosing effects, on the sessions of gap_blind.py: what they get wrong.
 
-    pip install scikit-learn
+    pip install "scikit-learn>=1.7"
     python bench/gap_baselines.py [--sessions N] [--processes P]
 
 All work on the same whitened rows and the same library: forward selection by AIC and by BIC,
@@ -88,7 +88,7 @@ METHODS: dict[str, Callable[[Rows, Projection], list[Candidate]]] = {
     'AIC': lambda rows, p: forward(p, 2.0),
     'BIC': lambda rows, p: forward(p, np.log(p.freedom)),
     'OMP': lambda rows, p: sparse(OrthogonalMatchingPursuitCV(cv=5, max_iter=_MOST), p),
-    'lasso': lambda rows, p: sparse(LassoCV(cv=5, n_alphas=30), p),
+    'lasso': lambda rows, p: sparse(LassoCV(cv=5, alphas=30), p),
     'no projection': lambda rows, p: [
         n.candidate for n in search(Unprojected(rows, library(rows.scene))).named
     ],

@@ -15,6 +15,8 @@ from rtest_identification.gap.rows import Rows
 # A candidate of which less than this is left beside the base model is invisible in these data.
 VISIBLE = 0.02
 NOTHING = 1e-9
+# Eigenvalue of signatures' products below which they are one and the same.
+_SAME = 1e-3
 _TRIALS = 3000
 # Values between two of a shape's grid that are tried before the best of them is refined.
 _SAMPLES = 25
@@ -111,7 +113,7 @@ class Projection:
             left = candidate.basis
             if basis is not None:
                 left, r = np.linalg.qr(left - basis @ (basis.T @ left))
-                left = left[:, np.abs(np.diag(r)) > 1e-3]
+                left = left[:, np.abs(np.diag(r)) > math.sqrt(_SAME)]
             return -float(((left.T @ y) ** 2).sum())
 
         tried = np.linspace(low, high, _SAMPLES)
@@ -157,7 +159,7 @@ class Projection:
         place = np.concatenate([np.arange(s.start, s.stop) for s in map(self.slice, chosen)])
         gram, score = self.gram[np.ix_(place, place)], self.score[place]
         values, vectors = np.linalg.eigh(gram)
-        good = values > 1e-3
+        good = values > _SAME
         return float(((vectors[:, good].T @ score) ** 2 / values[good]).sum())
 
     def slice(self, index: int) -> slice:

@@ -101,9 +101,10 @@ def _result(
 
 def _refine(projection: Projection, best: list[int]) -> list[int]:
     """The same effects with the best shapes."""
-    best = [*best]
     for place in range(len(best)):
-        best[place] = projection.refine(best, place)
+        other = [*best[:place], projection.refine(best, place), *best[place + 1 :]]
+        # Never worse than before, so that a search which only goes down comes to an end.
+        best = min(best, other, key=projection.criterion)
     return best
 
 
