@@ -10,7 +10,6 @@ import numpy as np
 from rtest_estimation.errors import UserError
 from rtest_identification.frustum.commands import Commands
 from rtest_identification.frustum.contour import along_normal, contour_error, response
-from rtest_identification.frustum.feature import Feature
 from rtest_identification.frustum.sources import (
     DRIFT,
     TRIALS,
@@ -20,7 +19,8 @@ from rtest_identification.frustum.sources import (
     draw,
     scene_of,
 )
-from rtest_identification.gap.effects import Effect, library
+from rtest_identification.gap.catalogue import every_effect
+from rtest_identification.gap.effects import Effect
 from rtest_identification.gap.model_file import Model, ModelEffect, Value
 from rtest_identification.gap.scene import Scene
 from rtest_identification.kinematics import ERROR_LETTERS, predict
@@ -47,7 +47,7 @@ def of_model(
             f'model {model.name!r} is of machine {model.machine!r}, the machine file of '
             f'{machine.name!r}; give the right one with --machine'
         )
-    constants = _constants(model, machine)
+    constants = constant_values(model, machine)
     errors = np.zeros((len(machine.letters), 6))
     for p, value in constants:
         errors.flat[p.column] = value.value
@@ -62,10 +62,10 @@ def of_model(
     error = constant_error = contour_error(commands, errors)
     at = predict(machine, commands.positions, errors, jacobian=True).jacobian
     scene = scene_of(commands, at)
-    kept, left = _usable(model)
+    kept, left = usable(model)
     notes += left
     for entry, (effect, shape) in zip(
-        kept, replace(model, effects=kept).resolve([*_every(machine), *effects]), strict=True
+        kept, replace(model, effects=kept).resolve([*every_effect(machine), *effects]), strict=True
     ):
         moved, spreads = _moved(entry, effect, shape, scene)
         error = error + moved
@@ -81,7 +81,7 @@ def of_model(
     )
 
 
-def _constants(model: Model, machine: Machine) -> list[tuple[ErrorParameter, Value]]:
+def constant_values(model: Model, machine: Machine) -> list[tuple[ErrorParameter, Value]]:
     known = {}
     for axis in machine.letters:
         for letter in ERROR_LETTERS:
@@ -102,7 +102,7 @@ def _constants(model: Model, machine: Machine) -> list[tuple[ErrorParameter, Val
     return found
 
 
-def _usable(model: Model) -> tuple[tuple[ModelEffect, ...], list[str]]:
+def usable(model: Model) -> tuple[tuple[ModelEffect, ...], list[str]]:
     """Effects that say something about a part, and why others do not."""
     kept, notes = [], []
     for entry in model.effects:
@@ -147,22 +147,3 @@ def _moved(
 
 def _sizes(entry: ModelEffect) -> str:
     return ', '.join(f'{name} {v.value:.3g} {v.unit}' for name, v in entry.parameters.items())
-
-
-def _every(machine: Machine) -> list[Effect]:
-    """Every effect that the machine can have, whatever ranges a path has.
-
-    The library offers harmonics or sags by how far an axis turns: one scene turns them fully, the
-    other one swivels them.
-    """
-    found: dict[str, Effect] = {}
-    for reach in (np.pi, 1.0):
-        ends = np.array([
-            [s * (reach if machine.axes[name].rotary else 0.1) for name in machine.letters]
-            for s in (-1.0, 1.0)
-        ])
-        blank = np.zeros((2, 3))
-        two = Commands(machine, Feature('', blank, blank, blank), ends)
-        for effect in library(scene_of(two, np.zeros((2, 3, 6 * len(machine.letters))))):
-            found.setdefault(effect.key, effect)
-    return list(found.values())

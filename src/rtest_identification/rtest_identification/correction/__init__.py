@@ -1,0 +1,1 @@
+"""Commands changed so that the predicted error of a machine vanishes to first order."""
