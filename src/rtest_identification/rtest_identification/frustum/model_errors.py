@@ -82,6 +82,7 @@ def of_model(
 
 
 def constant_values(model: Model, machine: Machine) -> list[tuple[ErrorParameter, Value]]:
+    """The constants of a model with the errors they are; UserError where it is none of these."""
     known = {}
     for axis in machine.letters:
         for letter in ERROR_LETTERS:
