@@ -16,6 +16,7 @@ from rtest_identification.gap.model_file import Model, Value
 from rtest_identification.gap.offline import gap_session
 from rtest_identification.gap.projection import Projection
 from rtest_identification.gap.rows import make_rows
+from rtest_identification.gap.workflow import analyse
 from rtest_identification.machine import load_machine
 from rtest_identification.observations import stack
 from rtest_identification.plans import diagnostic, static
@@ -118,7 +119,7 @@ def test_a_pose_that_contradicts_others_is_left_out_and_told():
 def test_an_error_that_a_model_leaves_out_is_named_and_freed():
     blind = session('static', seed=7)
     symbols = [s for s in blind.constants if s != 'E_X(0B)C']
-    model = Model('without', MACHINE.name, {s: Value(0.0, None, 'm') for s in symbols})
+    model = Model('without', MACHINE.name, {s: Value(0.0, None, '') for s in symbols})
     found = gap_session(blind.machine, blind.cycles, blind.directions, model)
     assert [f.effect.key for f in found.result.found] == ['location/E_X(0B)C']
     value, stddev = found.result.found[0].value[0], found.result.found[0].stddev[0]
@@ -160,3 +161,37 @@ def test_an_effect_that_does_nothing_is_not_hidden():
     where = setting(MACHINE, PLANS['static'], rng)
     nothing = Hidden('', {'E_XC': np.ones(len(where.poses))})
     assert make(where, [nothing], [10.0], Noise(2.5e-7), rng) is None
+
+
+def test_two_effects_that_stand_in_for_another_are_not_named():
+    # Without the scale of X those of Y and Z together come close to it.
+    blind = session('static', ['scale/X'], [25.0], seed=12)
+    observations = stack(MACHINE, blind.cycles)
+    start = blind.cycles[0].plan.stamp
+    result = analyse(observations, start, blind.directions, without=('scale/X',))
+    assert result.verdict == 'unknown effect' and not result.found
+
+
+def test_numbers_of_a_model_that_do_not_hold_are_told():
+    blind = session('static', ['scale/Y'], [20.0], seed=13)
+    first = gap_session(blind.machine, blind.cycles, blind.directions)
+    (scale,) = first.result.found
+    assert scale.effect.key == 'scale/Y'
+    other = session('static', seed=13)
+    again = gap_session(other.machine, other.cycles, other.directions, first.model)
+    # The constants are the same, the scale is not there.
+    assert [d.name for d in again.result.differs] == ['scale/Y: e']
+    (carried,) = again.result.carried
+    assert abs(carried.value[0]) < 4.0 * carried.stddev[0]
+    (entry,) = again.model.effects
+    assert entry.parameters['e'].value == carried.value[0]
+
+
+def test_constants_that_the_poses_leave_open_have_no_uncertainty():
+    blind = session('diagnostic', seed=14)
+    cycle = blind.cycles[1]
+    part = replace(cycle, points=cycle.points[:12])
+    found = gap_session(blind.machine, [blind.cycles[0], part], blind.directions)
+    assert not np.isfinite(found.result.constants.stddev).all()
+    left = [s for s, v in found.model.values.items() if v.stddev is None]
+    assert 'E_A(0B)C' in left

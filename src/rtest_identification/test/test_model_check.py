@@ -31,7 +31,7 @@ def test_every_effect_that_data_offer_is_known_without_them():
 def test_a_model_frees_what_it_lists_and_all_where_it_lists_nothing():
     symbols = [p.symbol for p in Model('m', 'NMV').free(MACHINE)]
     assert len(symbols) == 11
-    listed = {s: Value(0.0, None, 'm') for s in (symbols[4], symbols[1])}
+    listed = {s: Value(0.0, None, '') for s in (symbols[4], symbols[1])}
     assert [p.symbol for p in Model('m', '', listed).free(MACHINE)] == [symbols[1], symbols[4]]
     with pytest.raises(UserError, match=r"'m': values: E_X\(0Y\)Q is no free error"):
         Model('m', '', {'E_X(0Y)Q': Value(0.0, None, 'm')}).free(MACHINE)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -15,6 +16,26 @@ from rtest_identification.gap.rows import Rows
 CONFUSABLE = 0.98
 # Stands for the base model.
 INVISIBLE = 'invisible'
+
+
+def described(effect: Effect, rows: Rows, library: Sequence[Effect]) -> str | None:
+    """One line on what a new effect looks like in these rows; None where like nothing else."""
+    found = confusions(effect, rows, library)
+    if not found:
+        return None
+    if found[0][0] != INVISIBLE:
+        names = ', '.join(f'{key} ({cosine:.3f})' for key, cosine in found)
+        return f'{effect.key} looks like {names} in these data (cosine)'
+    without = len(rows.constants) + rows.scene.observations.offsets().shape[2]
+    if rows.base.shape[2] > without:
+        # Whether it is the model's effects that do the same.
+        plain = replace(rows, base=rows.base[:, :, :without])
+        if INVISIBLE not in dict(confusions(effect, plain, library)):
+            return f'{effect.key} is already in the model, as itself or as effects that do the same'
+    return (
+        f'these data cannot show {effect.key}: location errors, squareness and the start of each '
+        'cycle do the same'
+    )
 
 
 def confusions(

@@ -88,6 +88,7 @@ class Model:
                     f'model {self.name!r}: values: {symbol} is no free error of this machine; '
                     f'it has {", ".join(known)}'
                 )
+            self._unit(symbol, self.values[symbol], known[symbol].unit)
         return tuple(p for s, p in known.items() if s in self.values or not self.values)
 
     def resolve(self, library: Sequence[Effect]) -> list[tuple[Effect, tuple[float, ...]]]:
@@ -111,8 +112,23 @@ class Model:
                     f'model {self.name!r}: {entry.key}: shape has {sorted(entry.shape)}, '
                     f'expected {sorted(names)}'
                 )
+            units = {p.name: p.unit for p in (*effect.parameters, *effect.shape)}
+            for name, value in (*entry.parameters.items(), *entry.shape.items()):
+                if name not in units:
+                    raise UserError(
+                        f'model {self.name!r}: {entry.key}: no parameter {name!r}, expected one '
+                        f'of {", ".join(units)}'
+                    )
+                self._unit(f'{entry.key}: {name}', value, units[name])
             found.append((effect, tuple(entry.shape[name].value for name in names)))
         return found
+
+    def _unit(self, where: str, value: Value, unit: str) -> None:
+        if value.unit and value.unit != unit:
+            raise UserError(
+                f'model {self.name!r}: {where}: unit {value.unit!r}, expected {unit!r}; a model '
+                'is in SI units'
+            )
 
 
 def load_model(path: Path | str) -> Model:

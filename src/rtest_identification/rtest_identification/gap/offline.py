@@ -18,7 +18,7 @@ from rtest_identification.gap.model_file import Model, ModelEffect, Value
 from rtest_identification.gap.rows import nest_spread
 from rtest_identification.gap.size import Found
 from rtest_identification.gap.user_effects import load_effects
-from rtest_identification.gap.workflow import GapResult, analyse
+from rtest_identification.gap.workflow import Carried, GapResult, analyse
 from rtest_identification.machine import Machine
 from rtest_identification.observations import stack
 from rtest_identification.offline import estimate_recording, machine_of
@@ -74,6 +74,10 @@ def gap_recording(
         if found:
             names = ', '.join(f'{key} ({cosine:.3f})' for key, cosine in found)
             alike.append(f'{effect.key} looks like {names} in these data (cosine)')
+    planned = sum(len(f.cycle.plan.commands) for f in finished)
+    missing = sum(len(f.cycle.missing) for f in finished)
+    if missing:
+        warnings.append(f'{missing} of {planned} poses are missing; `rtest info` says why')
     return replace(
         session, warnings=(*recording.warnings, *warnings), confusions=tuple(alike)
     )
@@ -106,7 +110,7 @@ def extend(
     """The model with what was found, and where that is from."""
     when = datetime.fromtimestamp(start / 1e9, timezone.utc).isoformat(timespec='seconds')
     values = {
-        p.symbol: Value(float(v), float(s), p.unit)
+        p.symbol: Value(float(v), _known(s), p.unit)
         for p, v, s in zip(
             result.constants.parameters, result.constants.value, result.constants.stddev,
             strict=True,
@@ -117,9 +121,12 @@ def extend(
         # An error that the model left out is freed like the others from now on.
         (parameter,) = found.effect.parameters
         values[found.effect.symbols[0]] = Value(
-            float(found.value[0]), float(found.stddev[0]), parameter.unit
+            float(found.value[0]), _known(found.stddev[0]), parameter.unit
         )
-    old = model.effects if model else ()
+    old = [
+        _again(entry, now, session, when)
+        for entry, now in zip(model.effects if model else (), result.carried, strict=True)
+    ]
     return Model(
         model.name if model else f'{machine.name or "machine"} after {session}', machine.name,
         values,
@@ -127,10 +134,25 @@ def extend(
     )
 
 
+def _again(entry: ModelEffect, now: Carried, session: str, when: str) -> ModelEffect:
+    """An effect of the model as large as it was in this session."""
+    sizes = {
+        p.name: Value(float(v), _known(s), p.unit)
+        for p, v, s in zip(now.effect.parameters, now.value, now.stddev, strict=True)
+    }
+    origin = {**entry.provenance, 'identified again': f'{session}, {when}'}
+    return replace(entry, parameters=sizes, provenance=origin)
+
+
+def _known(stddev: float) -> float | None:
+    """None of a value that the data leave open."""
+    return float(stddev) if np.isfinite(stddev) else None
+
+
 def _entry(found: Found, result: GapResult, session: str, when: str) -> ModelEffect:
     linear, shape = found.effect.parameters, found.effect.shape
     pairs = [
-        Value(float(v), float(s) if np.isfinite(s) else None, p.unit)
+        Value(float(v), _known(s), p.unit)
         for p, v, s in zip((*linear, *shape), found.value, found.stddev, strict=True)
     ]
     gap = result.gap

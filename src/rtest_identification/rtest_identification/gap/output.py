@@ -24,6 +24,20 @@ def as_dict(session: str, result: GapResult, model: str | None = None) -> dict[s
         'verdict': result.verdict,
         'effects': [_effect(found) for found in result.found],
         'invisible': list(result.invisible),
+        'undetermined': undetermined(result),
+        'carried': [
+            {
+                'key': now.effect.key,
+                'parameters': dict(zip(names, now.value.tolist(), strict=True)),
+                'stddev': dict(zip(names, map(_number, now.stddev.tolist()), strict=True)),
+            }
+            for now in result.carried for names in [[p.name for p in now.effect.parameters]]
+        ],
+        'model_differs': [
+            {'name': d.name, 'model': d.model, 'found': d.found, 'stddev': d.stddev,
+             'unit': d.unit}
+            for d in result.differs
+        ],
         'where': [
             {'by': place.by, 'value': place.value, 'rms': place.rms, 'p': place.p}
             for place in result.where
@@ -42,6 +56,13 @@ def as_dict(session: str, result: GapResult, model: str | None = None) -> dict[s
         'rest_probability': result.rest_probability,
         'model': model,
     }
+
+
+def undetermined(result: GapResult) -> list[str]:
+    """Symbols of the constants that these poses leave open."""
+    constants = result.constants
+    return [p.symbol for p, s in zip(constants.parameters, constants.stddev, strict=True)
+            if not math.isfinite(s)]
 
 
 def write(session: str, result: GapResult, out: Path, model: str | None = None) -> Path:
@@ -113,6 +134,21 @@ def lines(result: GapResult) -> list[str]:
         if found.rivals:
             told.append(f'  could also be {", ".join(found.rivals)}')
             told.append(f'  to tell them apart: {found.separate_by}')
+    left = undetermined(result)
+    if left:
+        told.append(f'not determined by these poses, each by itself: {", ".join(left)}')
+    for now in result.carried:
+        sizes = ', '.join(
+            f'{p.name} = {v:.3g} ± {2 * s:.2g} {p.unit}' if math.isfinite(s)
+            else f'{p.name} open'
+            for p, v, s in zip(now.effect.parameters, now.value, now.stddev, strict=True)
+        )
+        told.append(f'{now.effect.key} of the model: {sizes} (k = 2) in this session')
+    for d in result.differs:
+        told.append(
+            f'{d.name} does not hold here: the model has {d.model:.3g}, this session '
+            f'{d.found:.3g} ± {2 * d.stddev:.2g} {d.unit} (k = 2)'
+        )
     if result.odd:
         poses = ', '.join(f'{cycle} {pose}' for cycle, pose in result.odd[:5])
         more = f' and {len(result.odd) - 5} more' if len(result.odd) > 5 else ''

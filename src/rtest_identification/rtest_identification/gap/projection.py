@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import optimize, stats
 
+from rtest_estimation.errors import UserError
 from rtest_identification.gap.effects import Effect
 from rtest_identification.gap.rows import Rows
 
@@ -62,6 +63,11 @@ class Projection:
             if not seen:
                 invisible.append(effect.key)
         self.invisible = tuple(invisible)
+        if not self.candidates:
+            raise UserError(
+                f'these {len(rows.residual)} poses show no effect of the library; measure more '
+                'poses, or see in `rtest info` why so many are missing'
+            )
         # How many the library offers; refined shapes come to them.
         self.offered = len(self.candidates)
         self.keys = len({c.effect.key for c in self.candidates})

@@ -33,6 +33,7 @@ class Rows:
     odd : (n,) poses that are far outside the noise
     constants : location errors and squareness that are free, the first columns of `base`
     errors : (p,) their values about which the rows stand
+    sizes : (k,) values of the effects' columns, the last of `base`
     """
 
     scene: Scene
@@ -45,6 +46,7 @@ class Rows:
     odd: np.ndarray
     constants: tuple[ErrorParameter, ...]
     errors: np.ndarray
+    sizes: np.ndarray
 
     def keep(self, chosen: np.ndarray) -> Rows:
         """Only these rows (bool mask or indices)."""
@@ -163,11 +165,14 @@ def _fit(
     if nests is None:
         nests = np.zeros((len(observations), 3, 0))
     rows = Rows(scene, left, base, noise.sigma, noise.freedom, noise.correlation, nests, noise.odd,
-                constants, errors)
+                constants, errors, np.zeros(0))
     design = rows.white(base)
     scale = 1.0 / np.maximum(np.linalg.norm(design, axis=0), 1e-300)
     value = solve(design, rows.white(left), scale).value
-    return replace(rows, residual=left - base @ value, errors=errors + value[: len(errors)])
+    sizes = value[len(errors) + 3 * len(observations.cycles) :]
+    return replace(
+        rows, residual=left - base @ value, errors=errors + value[: len(errors)], sizes=sizes
+    )
 
 
 def _starts(observations: Observations) -> np.ndarray:

@@ -10,7 +10,7 @@ import numpy as np
 from rtest_identification.gap.projection import Candidate, Projection
 
 # Probability of taking the best of all candidates for real where there is nothing.
-FALSE_ALARM = 0.004
+FALSE_ALARM = 0.003
 # The same for every further effect.
 FURTHER_ALARM = 0.001
 # Candidates less than 100 times less likely are rivals.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -17,6 +17,8 @@ from rtest_identification.symbols import location_parameters
 
 # Two signatures less than this apart (sine of their angle) are alike in these data.
 _APART = 0.2
+# And these are the same but for rounding.
+_SAME = 1e-6
 
 
 def separate(
@@ -36,6 +38,9 @@ def separate(
             name: _angle(rows, plans, effect.key, rival, more) for name, plans in options.items()
         }
         now = apart.pop('')
+        if now < _SAME and _same(rows, options.values(), effect.key, rival, more):
+            told.setdefault('the same effect', []).append(rival)
+            continue
         best = max(apart, key=apart.__getitem__, default=None)
         if best is None or apart[best] < max(_APART, 1.5 * now):
             word = 'no further R-test pose; measure one of the two directly (laser, straightedge)'
@@ -98,6 +103,31 @@ def _angle(
         rest = mine - other @ (other.T @ mine)
         smallest = min(smallest, float(np.linalg.norm(rest) / np.sqrt(mine.shape[1])))
     return smallest
+
+
+def _same(
+    rows: Rows,
+    options: Iterable[Sequence[CyclePlan]],
+    key: str,
+    rival: str,
+    more: Sequence[Effect],
+) -> bool:
+    """Whether two effects are the same error motions, not only the same displacements.
+
+    Twins move the sphere alike because of the chain; with a response drawn at random for every
+    pose and error they do not.
+    """
+    scene = _extended(rows, [plan for plans in options for plan in plans])
+    response = np.random.default_rng(0).standard_normal(scene.jacobian.shape)
+    effects = {e.key: e for e in (*library(scene), *more)}
+    scene = replace(scene, jacobian=response)
+    one, other = effects[key], effects[rival]
+    if len(one.parameters) != len(other.parameters):
+        return False
+    mine, theirs = (
+        [np.linalg.qr(_flat(e.columns(scene, shape)))[0] for shape in e.grid] for e in (one, other)
+    )
+    return all(min(np.linalg.norm(a - b @ (b.T @ a)) for b in theirs) < _SAME for a in mine)
 
 
 def _flat(columns: np.ndarray) -> np.ndarray:

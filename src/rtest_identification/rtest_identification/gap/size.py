@@ -14,7 +14,7 @@ from rtest_identification.gap.search import Named
 from rtest_identification.gap.separate import separate
 
 # A parameter of which this share is in what the data do not show is not determined.
-_HIDDEN_SHARE = 0.05
+HIDDEN_SHARE = 0.05
 
 Chosen = tuple[Effect, tuple[float, ...]]
 
@@ -103,9 +103,27 @@ def visible(
     rest = float(y @ y - ((v[:, good].T @ y) ** 2).sum())
     cofactor = inverse @ inverse.T / np.outer(norm, norm)
     # What lies partly in a combination that is set to zero may have any size.
-    open_ones = (wt[~good] ** 2).sum(axis=0) > _HIDDEN_SHARE**2
+    open_ones = (wt[~good] ** 2).sum(axis=0) > HIDDEN_SHARE**2
     cofactor[open_ones, open_ones] = np.inf
     return value / norm, cofactor, rest
+
+
+def overlap(rows: Rows, chosen: Sequence[Chosen]) -> float:
+    """Largest cosine between what is seen of two of the effects; 0 of one alone.
+
+    Effects that are there by themselves have little to do with each other. Those that stand in for
+    another one, which the library lacks, need each other.
+    """
+    value, _, _ = visible(rows, chosen)
+    base, seen, column = _base(rows), [], 0
+    for effect, shape in chosen:
+        part = slice(column, column + len(effect.parameters))
+        column = part.stop
+        whole = rows.white(effect.columns(rows.scene, shape) @ value[part])
+        left = whole - base @ (base.T @ whole)
+        seen.append(left / max(float(np.linalg.norm(left)), 1e-300))
+    cosines = np.abs(np.array(seen) @ np.array(seen).T)
+    return float(np.max(cosines - np.diag(np.diag(cosines))))
 
 
 def _base(rows: Rows) -> np.ndarray:

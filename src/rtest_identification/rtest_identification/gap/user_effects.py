@@ -83,6 +83,20 @@ def load_effects(
     return list(effects.values())
 
 
+def of_positions(effect: Effect) -> bool:
+    """Whether an effect of the user's own is error motions that hang on positions alone."""
+    own = {*(p.name for p in effect.parameters), *(p.name for p in effect.shape)}
+    return all(
+        axis and not any(_elsewhere(name) for name in formula.names - own)
+        for axis, _, formula in effect.columns.terms
+    )
+
+
+def _elsewhere(name: str) -> bool:
+    """Whether a formula's name is time, a direction of motion, a temperature or a reading."""
+    return name == 't' or '(' in name or '.' in name or bool(_GAUGE.fullmatch(name))
+
+
 @dataclass(frozen=True)
 class _Columns:
     """The columns of an effect: its formulas over a scene.
@@ -109,7 +123,7 @@ class _Columns:
                 )
             # Refinement looks a little beyond the ends, where the formula may mean nothing.
             values[name] = min(max(value, low), high)
-        columns = np.zeros((len(scene.observations), 3, len(self.parameters)))
+        columns = np.zeros((*scene.jacobian.shape[:2], len(self.parameters)))
         for axis, letter, formula in self.terms:
             for name in formula.names.difference(values, self.parameters):
                 values[name] = self._variable(scene, name, formula.where)
