@@ -9,12 +9,12 @@ import sys
 from collections.abc import Sequence
 from typing import NoReturn
 
-from rtest_drivers.commands import correct, demo, frustum, gap, identify, info, plan, session
+from rtest_drivers.commands import correct, demo, frustum, gap, identify, info, plan, session, thermal
 from rtest_drivers.graph import ONE_THREAD
 from rtest_drivers.runner import NodeFailed, Stopped
 from rtest_estimation.errors import UserError
 
-COMMANDS = (session, demo, plan, identify, gap, frustum, correct, info)
+COMMANDS = (session, demo, plan, identify, gap, thermal, frustum, correct, info)
 EXIT_FAILED, EXIT_USER, EXIT_INTERRUPTED, EXIT_PIPE = 1, 2, 130, 141
 
 

@@ -31,7 +31,7 @@ def described(effect: Effect, rows: Rows, library: Sequence[Effect]) -> str | No
         # Whether it is the model's effects that do the same.
         plain = replace(rows, base=rows.base[:, :, :without])
         if INVISIBLE not in dict(confusions(effect, plain, library)):
-            return f'{effect.key} is already in the model, as itself or as effects that do the same'
+            return f'{effect.key} is already in the model, or what its effects do is the same'
     return (
         f'these data cannot show {effect.key}: location errors, squareness and the start of each '
         'cycle do the same'

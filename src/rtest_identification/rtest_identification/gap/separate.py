@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from rtest_estimation.records import CyclePlan
-from rtest_identification.gap.effects import Effect, library
+from rtest_identification.gap.effects import Effect, library, location
 from rtest_identification.gap.rows import Rows
 from rtest_identification.gap.scene import Scene
 from rtest_identification.observations import Observations
@@ -80,7 +80,7 @@ def _angle(
 ) -> float:
     """Sine of the angle between two signatures beside the base model."""
     scene = _extended(rows, plans) if plans else rows.scene
-    effects = {e.key: e for e in (*library(scene), *more)}
+    effects = {e.key: e for e in (*library(scene), *_locations(scene), *more)}
     if key not in effects or rival not in effects:
         return 0.0
     columns = [p.column for p in location_parameters(scene.machine)]
@@ -119,7 +119,7 @@ def _same(
     """
     scene = _extended(rows, [plan for plans in options for plan in plans])
     response = np.random.default_rng(0).standard_normal(scene.jacobian.shape)
-    effects = {e.key: e for e in (*library(scene), *more)}
+    effects = {e.key: e for e in (*library(scene), *_locations(scene), *more)}
     scene = replace(scene, jacobian=response)
     one, other = effects[key], effects[rival]
     if len(one.parameters) != len(other.parameters):
@@ -170,3 +170,8 @@ def _held(steps: np.ndarray) -> np.ndarray:
     for row in range(1, len(held)):
         held[row] = np.where(held[row] == 0, held[row - 1], held[row])
     return held
+
+
+def _locations(scene: Scene) -> list[Effect]:
+    """Constants, which are candidates where a model leaves them out."""
+    return [location(parameter) for parameter in location_parameters(scene.machine)]
