@@ -201,6 +201,24 @@ def test_moves_by_mdi_find_wrong_sign_unit_and_name(cell: Cell) -> None:
     assert after == pytest.approx(before, abs=1e-7)
 
 
+def test_check_of_a_session_file_moves_every_axis(
+    cell: Cell, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    text = cell.device.read_text()
+    wrong = tmp_path / 'wrong.yaml'
+    wrong.write_text(text.replace('{index: 4, unit: deg}', '{index: 4, unit: deg, sign: -1}'))
+    config = tmp_path / 'session.yaml'
+    for device, status in ((cell.device, 0), (wrong, 1)):
+        config.write_text(
+            SESSION.format(machine=config_path('nmv1500dcg.yaml'))
+            + f'devices: {{cnc: {{backend: linuxcnc, file: {device}}}}}\n'
+        )
+        assert main(['session', '--config', str(config), '--check', '--moves']) == status
+        said = capsys.readouterr()
+        assert 'X +1 mm: as it should' in said.out and 'B +1 deg: as it should' in said.out
+    assert 'C +1 deg: axes: C: sign: 1 instead of -1' in said.err
+
+
 def test_units_are_held_to_what_linuxcnc_says(cell: Cell) -> None:
     wrong = cell.folder / 'unit.yaml'
     text = (cell.folder / 'watch.yaml').read_text()

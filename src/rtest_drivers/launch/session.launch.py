@@ -16,7 +16,7 @@ ARGUMENTS = {
     'config': (str(config_path('demo.yaml')), 'session file: machine, cycle, set-ups (YAML)'),
     'out': ('out', 'the recording is written to out/session/session.mcap'),
     'session': ('', 'name of the session; empty: name of the file, date and time'),
-    'simulate': ('', 'truth file of a simulated cell; empty: gauges and cnc are in the graph'),
+    'simulate': ('', 'truth file of a simulated cell; empty: the devices of the session file'),
     'rate': ('1.0', 'simulated seconds per second'),
     'namespace': ('', 'of every node and topic'),
 }
@@ -34,7 +34,10 @@ def graph(context: LaunchContext) -> list[Node]:
         rate=float(chosen['rate']),
         namespace=chosen['namespace'],
     )
-    settings = replace(settings, sphere_radius=load_session(config).sphere_radius)
+    session = load_session(config)
+    settings = replace(
+        settings, sphere_radius=session.sphere_radius, devices=session.devices
+    )
     return [
         (LifecycleNode if node.lifecycle else Node)(
             package=node.package,

@@ -7,13 +7,20 @@ A backend stamps at the read, in the clock of its device. It counts what the dev
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Protocol, TypeVar
+from typing import Any, Protocol, TypeVar
 
 from rtest_drivers.cell_link import CNC, GAUGES, CellCnc, CellGauges
+from rtest_drivers.cnc.linuxcnc import LinuxCnc
+from rtest_drivers.cnc.mtconnect import MtConnect
+from rtest_drivers.cnc.opcua import OpcUa
+from rtest_drivers.gauges.nest import SerialNest
 from rtest_estimation.errors import UserError
 from rtest_estimation.records import Feedback, GaugeBlock
 
-__all__ = ['CNC', 'CNC_BACKENDS', 'GAUGES', 'GAUGE_BACKENDS', 'CncBackend', 'GaugeBackend']
+__all__ = [
+    'CELL', 'CNC', 'CNC_BACKENDS', 'GAUGES', 'GAUGE_BACKENDS', 'CncBackend', 'GaugeBackend',
+    'make',
+]
 
 
 class GaugeBackend(Protocol):
@@ -31,23 +38,48 @@ class GaugeBackend(Protocol):
     def close(self) -> None:
         """Disconnect; does nothing where it is not open."""
 
+    def health(self) -> tuple[str, dict[str, Any]]:
+        """What is wrong since the last call while readings go on, '' for nothing; figures."""
+
 
 class CncBackend(Protocol):
-    """A CNC's encoder feedback; the same calls as `GaugeBackend`."""
+    """A CNC's encoder feedback."""
 
     def open(self) -> None:
         """Connect; raises ConnectionError saying what failed and what to do."""
 
     def read(self, timeout: float) -> list[Feedback]:
-        """What came since the last call, waiting up to `timeout` [s] for the first."""
+        """What came since the last call, waiting up to `timeout` [s] for the first.
+
+        Empty where nothing came in that time. Raises ConnectionError when the device is lost.
+        """
 
     def close(self) -> None:
         """Disconnect; does nothing where it is not open."""
 
+    def problem(self) -> str:
+        """What is wrong while the connection stands, in one line; '' where all is well."""
 
-# Name of the parameter `backend` to what makes one from the parameter `address`.
-GAUGE_BACKENDS: dict[str, Callable[[str], GaugeBackend]] = {'cell': CellGauges}
-CNC_BACKENDS: dict[str, Callable[[str], CncBackend]] = {'cell': CellCnc}
+    def uncertainty(self) -> float:
+        """Of the stamps [s]; NaN where it is not known."""
+
+    def told(self) -> dict[str, str]:
+        """What diagnostics show.
+
+        Where the controller says so: `program`, IDLE while no NC program runs, and `estop`, on or
+        off.
+        """
+
+
+CELL = 'cell'
+# Name of the parameter `backend` to what makes one from the parameter `address`: the socket of the
+# simulated cell, or the path of a device file.
+GAUGE_BACKENDS: dict[str, Callable[[str], GaugeBackend]] = {
+    CELL: CellGauges, 'serial': SerialNest,
+}
+CNC_BACKENDS: dict[str, Callable[[str], CncBackend]] = {
+    CELL: CellCnc, 'linuxcnc': LinuxCnc, 'mtconnect': MtConnect, 'opcua': OpcUa,
+}
 
 _Backend = TypeVar('_Backend')
 

@@ -287,6 +287,10 @@ class CellGauges(CellClient):
         """Blocks since the last call; raises LinkError when the cell is gone."""
         return [record for record in super().read(timeout) if isinstance(record, GaugeBlock)]
 
+    def health(self) -> tuple[str, dict[str, str]]:
+        """The cell has nothing to tell of itself."""
+        return '', {}
+
 
 class CellCnc(CellClient):
     """The simulated cell's encoders: backend 'cell' of the CNC driver."""
@@ -297,6 +301,18 @@ class CellCnc(CellClient):
     def read(self, timeout: float) -> list[Feedback]:
         """Feedback since the last call; raises LinkError when the cell is gone."""
         return [record for record in super().read(timeout) if isinstance(record, Feedback)]
+
+    def problem(self) -> str:
+        """The cell has nothing to tell of itself."""
+        return ''
+
+    def uncertainty(self) -> float:
+        """None: the cell's stamps are its time."""
+        return 0.0
+
+    def told(self) -> dict[str, str]:
+        """The cell has nothing to tell of itself."""
+        return {}
 
 
 def _clear(address: str) -> None:

@@ -9,7 +9,17 @@ import sys
 from collections.abc import Sequence
 from typing import NoReturn
 
-from rtest_drivers.commands import correct, demo, frustum, gap, identify, info, plan, session, thermal
+from rtest_drivers.commands import (
+    correct,
+    demo,
+    frustum,
+    gap,
+    identify,
+    info,
+    plan,
+    session,
+    thermal,
+)
 from rtest_drivers.graph import ONE_THREAD
 from rtest_drivers.runner import NodeFailed, Stopped
 from rtest_estimation.errors import UserError

@@ -9,8 +9,12 @@ import time
 import uuid
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rtest_estimation.errors import UserError
+
+if TYPE_CHECKING:
+    from rtest_identification.session_file import Device
 
 ParameterValue = str | int | float | bool
 
@@ -56,7 +60,8 @@ class GraphSettings:
     session : name of the session, of its folder and of its recording
     sphere_radius : of the session file [m]
     out : the recording is written to out/session/session.mcap
-    simulate : truth file of the simulated cell; None where real drivers are already in the graph
+    simulate : truth file of the simulated cell; None for real devices
+    devices : of the session file, for the drivers that are to be started; not used with `simulate`
     rate : simulated seconds per second of wall time
     namespace : of every node and topic, empty for none
     remaps : rules ``from:=to`` for every node
@@ -67,6 +72,7 @@ class GraphSettings:
     session: str
     out: Path
     simulate: Path | None = None
+    devices: dict[str, Device] = field(default_factory=dict)
     sphere_radius: float = 0.0127
     rate: float = 1.0
     namespace: str = ''
@@ -123,8 +129,8 @@ def cell_address() -> str:
 def session_nodes(settings: GraphSettings) -> tuple[GraphNode, ...]:
     """The nodes of a session, in the order in which they are started.
 
-    Without a simulated cell the drivers are expected in the graph already: the session node
-    waits for them and says which one is missing.
+    Without a simulated cell the drivers read from the devices of the session file. One that has
+    none there is expected in the graph already: the session node waits for it and says so.
     """
     simulated = settings.simulate is not None
     clock: dict[str, ParameterValue] = {'use_sim_time': simulated}
@@ -156,6 +162,16 @@ def session_nodes(settings: GraphSettings) -> tuple[GraphNode, ...]:
             ),
             GraphNode('gauges', 'rtest_drivers', driver, lifecycle=True),
             GraphNode('cnc', 'rtest_drivers', driver, lifecycle=True),
+        ]
+    else:
+        nodes += [
+            GraphNode(
+                name,
+                'rtest_drivers',
+                {'backend': device.backend, 'address': str(device.file), **clock},
+                lifecycle=True,
+            )
+            for name, device in settings.devices.items()
         ]
     nodes.append(
         GraphNode(

@@ -62,10 +62,20 @@ class Progress:
 
     stamp : start of the cycle [ns]; wall : the same on the wall clock [s]
     limit : longest time the cycle may take [s]; 0 is an estimate from its path
+    attended : somebody starts the machine when all is ready, so that times count from the first
+        pose on
     """
 
-    def __init__(self, plan: CyclePlan, stamp: int, wall: float, limit: float = 0.0) -> None:
+    def __init__(
+        self,
+        plan: CyclePlan,
+        stamp: int,
+        wall: float,
+        limit: float = 0.0,
+        attended: bool = False,
+    ) -> None:
         self._poses = len(plan.commands)
+        self._attended = attended
         self._stamp = stamp
         self._limit = limit or path_duration(plan)
         self._patience = pose_patience(plan)
@@ -90,6 +100,9 @@ class Progress:
         """
         if done > self._done:
             self._done, self._gained = done, (now, wall)
+        if self._attended and not self._done:
+            self._stamp, self._gained = now, (now, wall)
+            return ''
         poses = f'{self._done} of {self._poses} poses'
         waited = (now - self._gained[0]) / NANOSECONDS
         patience = self._patience if self._done else max(self._patience, FIRST_S)

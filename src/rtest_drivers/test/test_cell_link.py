@@ -171,7 +171,8 @@ def test_bad_addresses(tmp_path: Path) -> None:
 
 def test_backends_by_name() -> None:
     assert isinstance(make(GAUGE_BACKENDS, 'cell', 'a'), CellGauges)
-    with pytest.raises(UserError, match=r"parameter backend: expected one of \['cell'\]"):
+    known = r"expected one of \['cell', 'linuxcnc', 'mtconnect', 'opcua'\]"
+    with pytest.raises(UserError, match=f'parameter backend: {known}'):
         make(CNC_BACKENDS, 'fanuc', 'a')
     with pytest.raises(UserError, match='address: missing'):
         make(CNC_BACKENDS, 'cell', '')

@@ -6,8 +6,9 @@ import time
 import numpy as np
 import pytest
 
+from rtest_drivers.clock import HostClock
 from rtest_drivers.cnc.axes import AxisSource
-from rtest_drivers.cnc.clock import DeviceClock, HostClock, Recent
+from rtest_drivers.cnc.clock import DeviceClock, Recent
 from rtest_drivers.cnc.join import Joiner, Sample
 
 MS = 1_000_000

@@ -68,7 +68,7 @@ def test_the_demo_is_planned(capsys, tmp_path):
         assert len(rows) == cycle['poses'] + 1
         for key in ('nc', 'nc_tcp'):
             program = (tmp_path / 'plan' / cycle[key]).read_text()
-            assert len(re.findall(r'\(MSG,POSE \d+\)', program)) == cycle['poses']
+            assert len(re.findall(r'\(POSE \d+\)', program)) == cycle['poses']
 
 
 def test_a_plan_can_be_measured_as_it_was_written(capsys, tmp_path):

@@ -82,3 +82,14 @@ def test_a_clock_that_stands_is_seen():
     assert progress.clock_stands(1, 5.0) == 0.0
     assert progress.clock_stands(1, 9.0) == 4.0
     assert progress.clock_stands(2, 10.0) == 0.0
+
+
+def test_where_somebody_starts_the_machine_times_count_from_the_first_pose():
+    progress = Progress(plan(THREE), 0, 0.0, attended=True)
+    hours = 7200
+    for second in (1, 60, hours):
+        assert not progress.stopped(second * SECOND, float(second), 0, math.inf)
+    assert not progress.stopped((hours + 5) * SECOND, hours + 5.0, 1, 0.02)
+    assert not progress.stopped((hours + 12) * SECOND, hours + 12.0, 2, 0.02)
+    why = progress.stopped((hours + 40) * SECOND, hours + 40.0, 2, 0.02)
+    assert why == '2 of 3 poses, no other pose for 28 s'

@@ -20,7 +20,7 @@ def model_file(tmp_path, key, parameters, shape=None):
         key, {k: Value(v, None, '') for k, v in parameters.items()},
         {k: Value(v, None, '') for k, v in (shape or {}).items()},
     )
-    save_model(Model('m', 'NMV', {}, (effect,)), tmp_path / 'model.yaml')
+    save_model(Model('m', 'NMV1500DCG', {}, (effect,)), tmp_path / 'model.yaml')
     return tmp_path / 'model.yaml'
 
 
@@ -65,10 +65,52 @@ def test_the_sphere_sees_it(tmp_path):
 
 @pytest.mark.parametrize(
     ('key', 'parameters', 'words'),
-    [('backlash/X', {'h': 1e-6}, 'not simulated'), ('scale/X', {'f': 1.0}, 'expected e'),
+    [('backlash/X', {'h': 1e-6}, 'not simulated'), ('scale/X', {'f': 1.0}, 'expected one of e'),
      ('scale/Q', {'e': 1.0}, 'no effect')],
 )
 def test_what_cannot_be_simulated_is_refused(tmp_path, key, parameters, words):
     path = model_file(tmp_path, key, parameters)
     with pytest.raises(UserError, match=words):
         load_truth(truth_file(tmp_path, path))
+
+
+OWN = 'effects: [{key: lobes/C, motions: {E_XC: "%s"}, parameters: {p: {unit: um}}}]'
+
+
+def own_truth_file(tmp_path, formula):
+    path = truth_file(tmp_path, model_file(tmp_path, 'lobes/C', {'p': 2e-6}))
+    effects = tmp_path / 'effects.yaml'
+    effects.write_text(OWN % formula)
+    with path.open('a') as file:
+        file.write(f'effects: {effects}\n')
+    return path
+
+
+def test_an_effect_of_the_users_own_moves_the_machine(tmp_path):
+    cell = load_truth(own_truth_file(tmp_path, 'p*cos(4*C)*sin(B)'))
+    at = {name: np.zeros(2) for name in cell.machine.letters}
+    at |= {'B': np.full(2, np.pi / 2), 'C': np.array([0.0, np.pi / 4])}
+    found = cell.errors.model.of_axis('C', at)
+    np.testing.assert_allclose(found, [[0, 0, 0, 2e-6, 0, 0], [0, 0, 0, -2e-6, 0, 0]], atol=1e-18)
+
+
+@pytest.mark.parametrize('formula', ['p*t', 'p*sign(C)', 'p*d1'])
+def test_an_own_effect_of_more_than_positions_is_not_simulated(tmp_path, formula):
+    with pytest.raises(UserError, match='not simulated'):
+        load_truth(own_truth_file(tmp_path, formula))
+
+
+def test_an_own_effect_that_is_not_given_and_effects_without_a_model(tmp_path):
+    path = truth_file(tmp_path, model_file(tmp_path, 'lobes/C', {'p': 2e-6}))
+    with pytest.raises(UserError, match='effects: beside model:'):
+        load_truth(path)
+    path.write_text(path.read_text().replace('model:', 'effects:'))
+    with pytest.raises(UserError, match='expected model: beside it'):
+        load_truth(path)
+
+
+def test_the_model_of_another_machine_is_refused(tmp_path):
+    model = model_file(tmp_path, 'scale/X', {'e': 1e-5})
+    model.write_text(model.read_text().replace('NMV1500DCG', 'other'))
+    with pytest.raises(UserError, match="is of machine 'other', the simulated one is 'NMV1500DCG"):
+        load_truth(truth_file(tmp_path, model))

@@ -15,7 +15,10 @@ ARRIVAL = 0.5
 
 
 class CycleEnd:
-    """Finds when a cycle is over: its last pose was stood at for the dwell, or the next began."""
+    """Finds when a cycle is over: its last pose was stood at for the dwell, or the next began.
+
+    The machine may stay at the last pose or go away after the dwell.
+    """
 
     def __init__(self, rules: DwellRules) -> None:
         self.rules = rules
@@ -28,35 +31,45 @@ class CycleEnd:
         self._tried: int | None = None
         self._end: int | None = None
 
-    def find(self, plan: CyclePlan, feedback: FeedbackBuffer, limit: int | None) -> int | None:
-        """End of the cycle [ns], or None while it is going on. Looks at new samples only."""
+    def find(
+        self, plan: CyclePlan, feedback: FeedbackBuffer, begin: int, limit: int | None
+    ) -> int | None:
+        """End of the cycle [ns], or None while it is going on. Looks at new samples only.
+
+        begin : from when feedback counts; limit : when the next cycle begins [ns]
+        """
         if self._end is not None:
             return self._end
         rotary = [axis in ROTARY_LETTERS for axis in plan.axes]
         near = [self.rules.near[turns] for turns in rotary]
         last = plan.commands[-1]
-        start = max(self._seen, bisect_left(feedback.stamps, plan.stamp))
-        for number in range(start, len(feedback)):
-            sample = feedback.samples[number]
+        start = bisect_left(feedback.stamps, max(self._seen + 1, plan.stamp))
+        for sample in feedback.samples[start:]:
             if limit is not None and sample.stamp >= limit:
                 return limit
-            self._seen = number + 1
-            if not _there(plan.axes, sample, last, near):
-                self._since = None
-                continue
+            self._seen = sample.stamp
+            there = _there(plan.axes, sample, last, near)
             if self._since is None:
-                self._since = sample.stamp
-            end = self._since + int((trailing(plan) * plan.dwell + ARRIVAL) * 1e9)
-            if sample.stamp >= end and self._tried != self._since:
-                self._tried = self._since
-                stamps, positions = feedback.window(plan, plan.stamp, end)
-                dwells, missing = find_dwells(plan, stamps, positions, self.rules)
-                reached = {d.index for d in dwells}
-                done = len(plan.commands) - 1 in reached
-                if done and (plan.kind is not Kind.DYNAMIC) and (len(reached) > 1 or not missing):
-                    self._end = end
-                    return end
+                self._since = sample.stamp if there else None
+                continue
+            dwell = trailing(plan) * plan.dwell
+            stood = (dwell + ARRIVAL if there else 0.5 * dwell) * 1e9
+            since, self._since = self._since, self._since if there else None
+            if sample.stamp - since < stood or self._tried == since:
+                continue
+            self._tried = since
+            end = since + int(stood) if there else sample.stamp
+            if self._done(plan, *feedback.window(plan, begin, end)):
+                self._end = end
+                return end
         return None
+
+    def _done(self, plan: CyclePlan, stamps: np.ndarray, positions: np.ndarray) -> bool:
+        """Whether the last pose was reached, and not as the first of all."""
+        dwells, missing = find_dwells(plan, stamps, positions, self.rules)
+        reached = {d.index for d in dwells}
+        done = len(plan.commands) - 1 in reached and plan.kind is not Kind.DYNAMIC
+        return done and (len(reached) > 1 or not missing)
 
 
 def _there(axes: tuple[str, ...], sample: Feedback, last: np.ndarray, near: list[float]) -> bool:

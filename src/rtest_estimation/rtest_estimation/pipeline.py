@@ -15,6 +15,7 @@ from rtest_estimation import nest as nests
 from rtest_estimation.average import Average, NoAverageError, average
 from rtest_estimation.buffers import FeedbackBuffer, GaugeBuffer
 from rtest_estimation.cycle_end import CycleEnd
+from rtest_estimation.cycle_start import CycleStart
 from rtest_estimation.dwell import ROTARY_LETTERS, Dwell, DwellRules, find_dwells
 from rtest_estimation.records import (
     Cycle,
@@ -28,8 +29,8 @@ from rtest_estimation.records import (
 )
 
 # Readings and feedback from before a plan arrives are kept this long: the plan travels on another
-# topic and may come late.
-KEEP_BEFORE_PLAN_NS = 10_000_000_000
+# topic and may come late. The same before the axes come to the first pose, for the approach to it.
+KEEP_BEFORE_NS = 10_000_000_000
 # The end of a cycle waits for gauge readings up to it, until the feedback is this far ahead.
 GAUGE_PATIENCE_NS = 2_000_000_000
 # A dwell mean scattered more than this is vibration or a machine still moving [m].
@@ -66,7 +67,7 @@ class Estimator:
         self._plans: list[CyclePlan] = []
         self._feedback = FeedbackBuffer()
         self._gauges = GaugeBuffer()
-        self._end = CycleEnd(self.rules.dwell)
+        self._start, self._end = CycleStart(self.rules.dwell), CycleEnd(self.rules.dwell)
         self.discarded = 0
 
     @property
@@ -92,20 +93,20 @@ class Estimator:
         if (plan.cycle, plan.stamp) not in [(p.cycle, p.stamp) for p in self._plans]:
             self._plans.append(plan)
             self._plans.sort(key=lambda p: p.stamp)
-            self._end.reset()
+            self._reset()
 
     def add_feedback(self, sample: Feedback) -> None:
         """Encoder positions; a sample not newer than the one before is dropped (frozen source)."""
         if not self._feedback.append(sample):
             self.discarded += 1
-        elif not self._plans and sample.stamp - self._feedback.first > 2 * KEEP_BEFORE_PLAN_NS:
-            self._feedback.forget(sample.stamp - KEEP_BEFORE_PLAN_NS)
+        elif sample.stamp - self._feedback.first > 2 * KEEP_BEFORE_NS and self._waits():
+            self._feedback.forget(sample.stamp - KEEP_BEFORE_NS)
 
     def add_gauges(self, block: GaugeBlock) -> None:
         """Gauge readings, one message's worth."""
         self._gauges.append(block)
-        if not self._plans and block.stamp - self._gauges.first > 2 * KEEP_BEFORE_PLAN_NS:
-            self._gauges.forget(block.stamp - KEEP_BEFORE_PLAN_NS)
+        if block.stamp - self._gauges.first > 2 * KEEP_BEFORE_NS and self._waits():
+            self._gauges.forget(block.stamp - KEEP_BEFORE_NS)
 
     def finished(self) -> Finished | None:
         """The next cycle whose data are complete, or None."""
@@ -113,7 +114,7 @@ class Estimator:
         if plan is None or not len(self._feedback):
             return None
         limit = self._plans[1].stamp if len(self._plans) > 1 else None
-        end = self._end.find(plan, self._feedback, limit)
+        end = self._end.find(plan, self._feedback, self._begin(plan), limit)
         if end is None:
             return None
         ahead = self._feedback.last - end > GAUGE_PATIENCE_NS
@@ -139,15 +140,31 @@ class Estimator:
         plan = self.current
         if plan is None:
             return None
-        stamps, positions = self._feedback.window(plan, plan.stamp, self._feedback.last)
+        stamps, positions = self._feedback.window(plan, self._begin(plan), self._feedback.last)
         dwells, _ = find_dwells(plan, stamps, positions, self.rules.dwell)
         return plan, len(dwells)
 
-    def _close(self, plan: CyclePlan, end: int) -> Finished:
-        stamps, positions = self._feedback.window(plan, plan.stamp, end)
-        times, displacement, status = self._gauges.window(plan.stamp, end)
-        self._plans.pop(0)
+    def _waits(self) -> bool:
+        """Whether no cycle has begun."""
+        if len(self._plans) > 1:
+            return False
+        return not self._plans or self._start.find(self._plans[0], self._feedback) is None
+
+    def _begin(self, plan: CyclePlan) -> int:
+        """From when data count for the current cycle [ns]."""
+        start = self._start.find(plan, self._feedback)
+        return plan.stamp if start is None else max(plan.stamp, start - KEEP_BEFORE_NS)
+
+    def _reset(self) -> None:
+        self._start.reset()
         self._end.reset()
+
+    def _close(self, plan: CyclePlan, end: int) -> Finished:
+        begin = self._begin(plan)
+        stamps, positions = self._feedback.window(plan, begin, end)
+        times, displacement, status = self._gauges.window(begin, end)
+        self._plans.pop(0)
+        self._reset()
         self._forget(self._plans[0].stamp if self._plans else end)
         if plan.kind is Kind.DYNAMIC:
             reason = 'dynamic cycles are recorded but not evaluated'

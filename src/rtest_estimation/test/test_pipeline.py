@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from synthetic import T0, displacement, nest_plan, run, session, static_plan
 
+from rtest_estimation.attempts import counted
 from rtest_estimation.pipeline import Estimator
 from rtest_estimation.records import Kind
 
@@ -80,6 +81,79 @@ def test_waiting_at_the_last_pose_changes_no_bit():
     assert [row[:3] for row in numbers(short)] == [
         row[:3] for row in numbers(estimate(plans, feedback, blocks))
     ]
+
+
+def waited(plans, feedback, blocks, seconds):
+    """The same session where the first cycle begins later than its plan, the axes elsewhere."""
+    first, shift = feedback[0], int(seconds * 1e9)
+    away = replace(first, position=first.position + [0.0, 0.0, 0.05, 0.0, 0.0])
+    before = [
+        replace(away, stamp=T0 + k * 20_000_000) for k in range(int(seconds * 50) - 25)
+    ]
+    later = [
+        [replace(one, stamp=one.stamp + shift) for one in some] for some in (feedback, blocks)
+    ]
+    plans = [plans[0], *(replace(p, stamp=p.stamp + shift) for p in plans[1:])]
+    return plans, [*before, *later[0]], later[1]
+
+
+def test_a_machine_that_is_started_minutes_later_changes_nothing_but_the_time():
+    plans = session()
+    feedback, blocks = run(plans)
+    done = estimate(plans, feedback, blocks)
+    late = estimate(*waited(plans, feedback, blocks, 300.0))
+    for one, other in zip(done, late, strict=True):
+        assert not other.cycle.missing
+        for point, same in zip(one.cycle.points, other.cycle.points, strict=True):
+            assert same.stamp == point.stamp + 300_000_000_000
+            assert np.array_equal(same.displacement, point.displacement)
+            # It has come from elsewhere: axes that had not moved before have.
+            known = point.approach != 0
+            assert np.array_equal(same.approach[known], point.approach[known])
+    assert late[0].cycle.points[0].approach.tolist() == [0, 0, -1, 0, 0]
+
+
+def test_nothing_piles_up_while_a_machine_is_waited_for():
+    plans = session()
+    feedback, blocks = run(plans)
+    plans, feedback, _ = waited(plans, feedback, blocks, 300.0)
+    estimator, most = Estimator(), 0
+    estimator.add_plan(plans[0])
+    for number in range(299 * 50):
+        estimator.add_feedback(feedback[number])
+        estimator.add_gauges(replace(blocks[0], stamp=feedback[number].stamp))
+        assert estimator.finished() is None
+        most = max(most, len(estimator._feedback), len(estimator._gauges.blocks))
+    assert most <= 21 * 50
+    assert estimator.progress()[1] == 0
+
+
+def test_a_machine_that_leaves_the_last_pose_after_its_dwell_has_finished():
+    """As at the end of an NC program, which moves the sphere out of the nest."""
+    plans = session()
+    feedback, blocks = run(plans, wait=plans[0].dwell)
+    estimator, done = Estimator(), []
+    # At the end of the dwell of each cycle 50 mm away, and there until the next one begins.
+    last = {p.stamp: max(f.stamp for f in feedback if f.stamp < q) for p, q in zip(
+        plans, [plans[1].stamp, 2**63], strict=True
+    )}
+    away = [
+        replace(f, stamp=f.stamp + k * 20_000_000,
+                position=f.position + [0.0, 0.0, 0.05, 0.0, 0.0])
+        for f in feedback if f.stamp in last.values() for k in range(1, 200)
+    ]
+    more = [replace(blocks[-1], stamp=f.stamp) for f in away[::10]]
+    items = [(f.stamp, estimator.add_feedback, f) for f in feedback + away]
+    items += [(b.stamp, estimator.add_gauges, b) for b in blocks + more]
+    estimator.add_plan(plans[0])
+    estimator.add_plan(plans[1])
+    for stamp, add, record in sorted(items, key=lambda item: item[0]):
+        add(record)
+        while (ready := estimator.finished()) is not None:
+            done.append((ready.cycle, stamp))
+    assert [len(cycle.points) for cycle, _ in done] == [28, 6]
+    for (cycle, stamp), plan in zip(done, plans, strict=True):
+        assert not cycle.missing and stamp - last[plan.stamp] < 1_000_000_000
 
 
 def test_readings_that_lag_behind_the_feedback_end_the_cycle_all_the_same():
@@ -208,3 +282,28 @@ def test_dynamic_cycles_are_named_as_not_evaluated():
     plan = replace(static_plan(T0), kind=Kind.DYNAMIC, dwell=0.0)
     done = estimate([plan], *run([replace(plan, dwell=0.3)]))
     assert 'not evaluated' in done[0].problem
+
+
+def test_of_a_cycle_measured_again_the_attempt_with_more_poses_counts():
+    """The program was stopped after half of the nest, and started again from its beginning."""
+    plans = session()
+    feedback, blocks = run(plans)
+    middle = plans[0].stamp + 8_000_000_000
+    shift = 10_000_000_000
+    early = [[one for one in some if one.stamp < middle] for some in (feedback, blocks)]
+    stop = early[0][-1]
+    early[0] += [replace(stop, stamp=stop.stamp + k * 20_000_000) for k in range(1, 100)]
+    again = [
+        [replace(one, stamp=one.stamp + shift) for one in some] for some in (feedback, blocks)
+    ]
+    repeated = [replace(plan, stamp=plan.stamp + shift) for plan in plans]
+    done = estimate([plans[0], *repeated], early[0] + again[0], early[1] + again[1])
+    assert [d.cycle.plan.cycle for d in done] == ['1a-nest', '1a-nest', '1a-static']
+    assert 5 < len(done[0].cycle.points) < 28 == len(done[1].cycle.points)
+    reasons = {m.reason for m in done[0].cycle.missing[1:]}
+    assert reasons == {'never reached'}
+    cycles = [d.cycle for d in done]
+    assert counted(cycles) == cycles[1:] == counted([cycles[2], cycles[1], cycles[0]])
+    worse = replace(cycles[2], points=cycles[2].points[:2],
+                    plan=replace(cycles[2].plan, stamp=cycles[2].plan.stamp + shift))
+    assert counted([*cycles, worse]) == cycles[1:]

@@ -32,6 +32,8 @@ MAP_SIGNIFICANCE = 0.01
 # A point this improbable under the fit (chi-squared, over all points) is an outlier.
 OUTLIER_PROBABILITY = 1e-4
 _ITERATIONS = 8
+# A column below a nanometre per unit is rounding, and no effect.
+_NOTHING = 1e-9
 
 
 @dataclass(frozen=True)
@@ -70,7 +72,8 @@ class Fit:
 
     location : location and squareness errors
     error_map : of the outer rotary axis; None where it has fewer than three stations
-    residual : (n, 3) what the map leaves, frame ``table`` [m]; 0 rows of outliers are left out
+    residual : (n, 3) what the map and a model's effects leave, frame ``table`` [m]; rows of
+        outliers are left out
     rms : of the residual per component, corrected for degrees of freedom [m]
     rms_location : the same with the location errors alone
     outliers : rows of the observations that were left out
@@ -108,7 +111,8 @@ def fit(observations: Observations, effects: Effects | None = None) -> Fit:
         result, explained, jacobian = _fit(kept)
         if effects is not None:
             free = effects(kept, jacobian, kept.displacement - result.residual)
-            result, explained, jacobian = _fit(kept, free, result.rms)
+            free = free[:, :, (np.abs(free) > _NOTHING).any(axis=(0, 1))]
+            result, explained, jacobian = _fit(kept, free, noise=result.rms)
         bad = _outliers(result.residual)
         if not bad.any() or np.sum(~bad) < 0.8 * len(observations):
             break
@@ -118,8 +122,7 @@ def fit(observations: Observations, effects: Effects | None = None) -> Fit:
     if inner and inner.significance < MAP_SIGNIFICANCE and not inner.undetermined:
         # Waves of the inner axis look in part like squareness: they are fitted together.
         waves = contrasts(kept, jacobian)
-        waves = waves if free is None else np.concatenate([waves, free], axis=2)
-        together, explained, jacobian = _fit(kept, waves, inner.rms)
+        together, explained, jacobian = _fit(kept, free, waves, inner.rms)
         if (together.location.determined >= result.location.determined).all():
             again = fit_grid(kept, jacobian, together.residual, explained)
             again = replace(again, significance=inner.significance)
@@ -128,12 +131,16 @@ def fit(observations: Observations, effects: Effects | None = None) -> Fit:
 
 
 def _fit(
-    observations: Observations, absorbed: np.ndarray | None = None, noise: float = 0.0
+    observations: Observations,
+    effects: np.ndarray | None = None,
+    waves: np.ndarray | None = None,
+    noise: float = 0.0,
 ) -> tuple[Fit, np.ndarray, np.ndarray]:
     """Fit, orthonormal basis (3 n, p) of what it explains, and the full Jacobian.
 
-    absorbed : (n, 3, k) columns that are free besides, whose values are not asked for
-    noise : of a component, where it is known better than from this fit [m]
+    effects : (n, 3, k) columns of a model that are free besides, taken out of the residual
+    waves : (n, 3, w) columns that are free besides, left in the residual
+    noise : of a component, where there is either of them [m]
     """
     constants = location_parameters(observations.machine)
     columns = [p.column for p in constants]
@@ -154,12 +161,15 @@ def _fit(
         errors = errors + change
         rms = _rms(left - design @ first.value, first.rank)
         weights = _Whitening(observations.covariance, rms)
-    if absorbed is not None:
+    nothing = np.zeros((len(observations), 3, 0))
+    effects = nothing if effects is None else effects
+    waves = nothing if waves is None else waves
+    if effects.size or waves.size:
         weights = _Whitening(observations.covariance, noise)
-        weights.absorb(absorbed, weights.rows(design) * scale)
+        weights.absorb(effects, waves, weights.rows(design) * scale)
         first = solve(weights.rows(design), weights.rows(left), scale)
     errors = errors + first.value[: len(errors)]
-    residual = left - design @ first.value
+    residual = weights.without_effects(left - design @ first.value)
     freedom = max(residual.size - first.rank - weights.absorbed, 1)
     unit = _variance(weights.rows(residual), freedom)
     gain = weights.gain(first.inverse)
@@ -170,7 +180,9 @@ def _fit(
     outer = observations.machine.rotary[0] if observations.machine.rotary else None
     places, station = stations(observations.axis(outer)) if outer else (np.empty(0), none)
     linear = (design, jacobian, weights)
-    flat = design.reshape(residual.size, -1)
+    flat = np.concatenate([design, effects], axis=2).reshape(residual.size, -1)
+    size = np.linalg.norm(effects, axis=(0, 1)) / np.sqrt(len(observations))
+    scale = np.append(scale, 1.0 / size)
     if len(places) < 3:
         return alone, _orthonormal(flat, scale), jacobian
     result, effect = _with_map(observations, alone, outer, (places, station), linear)
@@ -212,6 +224,7 @@ def _with_map(
     # What the map takes away from the constants: shift of the first solution.
     shift = solve(a, y - b @ coordinates, scale_a)
     residual = alone.residual - effect @ coordinates - design @ shift.value
+    residual = weights.without_effects(residual)
     freedom = max(residual.size - shift.rank - second.rank - weights.absorbed, 1)
     unit = _variance(weights.rows(residual), freedom)
     before = float((weights.rows(alone.residual) ** 2).sum())
@@ -257,10 +270,7 @@ def _location(
 
 
 class _Whitening:
-    """Scales rows to unit variance: scatter of the readings plus what differs between dwells.
-
-    absorbed : how many columns are taken out of every row
-    """
+    """Scales rows to unit variance: scatter of the readings plus what differs between dwells."""
 
     def __init__(self, covariance: np.ndarray, rms: float) -> None:
         readings = float(np.trace(covariance, axis1=1, axis2=2).mean()) / 3.0
@@ -270,21 +280,29 @@ class _Whitening:
         total = covariance + dwell * np.eye(3)
         self.factor = np.linalg.inv(np.linalg.cholesky(total))
         self.typical = float(np.sqrt(np.trace(total, axis1=1, axis2=2).mean() / 3.0))
-        self._basis: np.ndarray | None = None
-        self.absorbed = 0
+        self._effects = self._basis = np.empty((3 * len(covariance), 0))
 
-    def absorb(self, columns: np.ndarray, kept: np.ndarray) -> None:
-        """Take columns (n, 3, k) out of every row from now on.
+    @property
+    def absorbed(self) -> int:
+        """How many columns are taken out of every row."""
+        return self._basis.shape[1]
+
+    def absorb(self, effects: np.ndarray, waves: np.ndarray, kept: np.ndarray) -> None:
+        """Take columns (n, 3, k) and (n, 3, w) out of every row from now on.
 
         What the `kept` columns (3 n, p) can make as well stays theirs: a wave that looks like the
         offset of a cycle is one.
         """
-        white = self.rows(columns)
-        basis = _orthonormal(white, 1.0 / np.linalg.norm(white, axis=0))
-        u, s, _ = np.linalg.svd(basis.T @ _orthonormal(kept, np.ones(kept.shape[1])))
-        shared = int(np.sum(s > 1.0 - 1e-6))
-        self._basis = basis @ u[:, shared:]
-        self.absorbed = self._basis.shape[1]
+        kept = _orthonormal(kept, np.ones(kept.shape[1]))
+        white = self.rows(np.concatenate([effects, waves], axis=2))
+        self._effects = _beside(white[:, : effects.shape[2]], kept)
+        self._basis = _beside(white, kept)
+
+    def without_effects(self, residual: np.ndarray) -> np.ndarray:
+        """(n, 3) without what the absorbed effects can make of it; waves stay."""
+        white = np.einsum('nij,nj->ni', self.factor, residual).reshape(-1)
+        part = (self._effects @ (self._effects.T @ white)).reshape(residual.shape)
+        return residual - np.linalg.solve(self.factor, part[:, :, None])[:, :, 0]
 
     def rows(self, values: np.ndarray) -> np.ndarray:
         """(n, 3) or (n, 3, p) to whitened (3 n,) or (3 n, p)."""
@@ -297,8 +315,6 @@ class _Whitening:
         return np.einsum('pni,nij->pnj', inverse.reshape(len(inverse), -1, 3), self.factor)
 
     def _free(self, white: np.ndarray) -> np.ndarray:
-        if self._basis is None:
-            return white
         return white - self._basis @ (self._basis.T @ white)
 
 
@@ -315,6 +331,15 @@ def _orthonormal(design: np.ndarray, scale: np.ndarray) -> np.ndarray:
     """Orthonormal basis of columns, of the rank that `solve` finds with this scale."""
     u, s, _ = np.linalg.svd(design * scale, full_matrices=False)
     return u[:, s > RANK_TOLERANCE * s[0]]
+
+
+def _beside(white: np.ndarray, kept: np.ndarray) -> np.ndarray:
+    """Orthonormal basis of what columns make that `kept`, orthonormal too, cannot make."""
+    if not white.size:
+        return white
+    basis = _orthonormal(white, 1.0 / np.linalg.norm(white, axis=0))
+    u, s, _ = np.linalg.svd(basis.T @ kept)
+    return basis @ u[:, int(np.sum(s > 1.0 - 1e-6)) :]
 
 
 def _outliers(residual: np.ndarray) -> np.ndarray:

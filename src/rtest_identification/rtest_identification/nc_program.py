@@ -239,7 +239,9 @@ def _poses(
             if spindle is not None:
                 angle = math.degrees(row[spindle]) % 360.0
                 lines.append(f'M19 R{round(angle, 3) % 360.0:.3f}')
-            lines += [f'(MSG,POSE {pose})', controller.dwell(plan.dwell)]
+            # No message: LinuxCNC keeps some twenty for a screen to fetch, and where there is none
+            # each further one holds the program, and what it tells of itself, for 5 s.
+            lines += [f'(POSE {pose})', controller.dwell(plan.dwell)]
             if settings.pause:
                 lines.append('M0')
     return lines

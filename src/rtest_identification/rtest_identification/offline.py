@@ -3,17 +3,31 @@
 from __future__ import annotations
 
 import heapq
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
+from rtest_estimation.attempts import counted
 from rtest_estimation.bagfile import Bag, read_bag
 from rtest_estimation.errors import UserError
 from rtest_estimation.missing import grouped
 from rtest_estimation.pipeline import EstimationRules, Estimator, Finished
-from rtest_estimation.recording import TYPES, Recording, recorded_machine, recording_of
-from rtest_identification.gap.model_file import load_model, model_columns
+from rtest_estimation.recording import (
+    TYPES,
+    Recording,
+    recorded_machine,
+    recording_of,
+    temperatures,
+)
+from rtest_identification.gap.effects import Effect, library
+from rtest_identification.gap.model_file import Model, load_model
+from rtest_identification.gap.scene import Scene
+from rtest_identification.gap.user_effects import load_effects
+from rtest_identification.location import Effects
 from rtest_identification.machine import Machine, load_machine, parse_machine
+from rtest_identification.observations import Observations
 from rtest_identification.pipeline import Identification, identify
 from rtest_identification.tolerance import Tolerances
 from rtest_identification.uncertainty import load_priors
@@ -24,7 +38,10 @@ def estimate_recording(
     rules: EstimationRules | None = None,
     progress: Callable[[str], None] = lambda line: None,
 ) -> list[Finished]:
-    """Every cycle of a recording, as the estimator node finished them."""
+    """Every cycle of a recording, as the estimator node finished them.
+
+    Of a cycle that was measured more than once the attempt that counts.
+    """
     estimator = Estimator(rules)
     done: list[Finished] = []
 
@@ -44,7 +61,8 @@ def estimate_recording(
             note(ready)
     for ready in estimator.finish():
         note(ready)
-    return done
+    kept = {id(cycle) for cycle in counted(one.cycle for one in done)}
+    return [one for one in done if id(one.cycle) in kept]
 
 
 def lost_cycles(finished: Iterable[Finished]) -> list[str]:
@@ -82,6 +100,7 @@ def identify_recording(
     priors_path: Path | str | None = None,
     model_path: Path | str | None = None,
     tolerances: Tolerances | None = None,
+    effects_path: Path | str | None = None,
 ) -> Identification:
     """Identify the machine from a recording alone.
 
@@ -92,6 +111,7 @@ def identify_recording(
     priors_path : file of what is known of the linear axes' error motions
     model_path : file of a model whose effects are free besides
     tolerances : by which the machine is to be judged afterwards
+    effects_path : file of the user's own effects that the model has
 
     Raises UserError naming file and what is expected.
     """
@@ -99,23 +119,50 @@ def identify_recording(
     bag = read_bag(path, TYPES)
     machine = machine_of(bag, machine_path, topics)
     priors = load_priors(priors_path, machine) if priors_path is not None else None
+    more, unread = [], []
+    if effects_path is not None:
+        if model is None:
+            raise UserError(f'{effects_path}: effects are those of a model; give it with --model')
+        more = load_effects(effects_path, machine, temperatures(bag, unread))
     if model:
-        model.check(machine)
+        model.check(machine, more)
     if tolerances:
         tolerances.check(machine)
     recording = recording_of(bag, topics)
     finished = estimate_recording(recording, None, progress)
     directions = {f.nest.setup: f.nest.direction for f in finished if f.nest is not None}
-    effects = model_columns(model, recording.plans[0].stamp, directions) if model else None
+    effects = None
+    if model:
+        effects = _effects_of(model, more, recording.plans[0].stamp, directions)
     try:
         result = identify(machine, [f.cycle for f in finished], priors, effects)
     except UserError as error:
         why = '; '.join(lost_cycles(finished))
         raise UserError(f'{path}: {error}' + (f' ({why})' if why else '')) from None
     problems = tuple(f'{f.cycle.plan.cycle}: {f.problem}' for f in finished if f.problem)
-    warnings = (*recording.warnings, *problems, *result.warnings)
+    warnings = (*recording.warnings, *unread, *problems, *result.warnings)
     return replace(result, warnings=warnings, session=result.session or recording.session,
                    model=model.name if model else None)
+
+
+def _effects_of(
+    model: Model, more: Sequence[Effect], start: int, directions: Mapping[str, np.ndarray]
+) -> Effects:
+    """The model's effects as columns for `location.fit`.
+
+    more : effects of the user's own
+    start : of the session [ns]; directions : of the gauges by set-up
+    """
+
+    def columns(
+        observations: Observations, jacobian: np.ndarray, fitted: np.ndarray
+    ) -> np.ndarray:
+        scene = Scene(observations, jacobian, fitted, start, directions)
+        chosen = model.resolve([*library(scene), *more])
+        empty = np.zeros((len(observations), 3, 0))
+        return np.concatenate([empty, *(e.columns(scene, s) for e, s in chosen)], axis=2)
+
+    return columns
 
 
 def _in_order(

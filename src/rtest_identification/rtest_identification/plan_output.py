@@ -170,6 +170,12 @@ def _session(config: SessionConfig) -> str:
     for name, stations in zip(config.machine.rotary, config.stations, strict=True):
         cycle[f'{name.lower()}_deg'] = [round(v, 9) + 0.0 for v in np.degrees(stations).tolist()]
     data = config.data | {'machine': 'machine.yaml', 'cycle': cycle}
+    if config.devices:
+        # Their files stay where they are.
+        data['devices'] = {
+            name: config.data['devices'][name] | {'file': str(device.file)}
+            for name, device in config.devices.items()
+        }
     head = '# Measures this plan: rtest session --config session.yaml\n'
     return head + yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=95)
 

@@ -43,8 +43,26 @@ _NAME = re.compile(r'[A-Za-z0-9][A-Za-z0-9._-]*')
 _BUILD = {STATIC: static, DIAGNOSTIC: diagnostic}
 _KEYS = {
     'machine', 'sphere_radius_mm', 'cycle', 'nest_calibration', 'spindle_runout', 'setups',
-    'moves', 'table', 'spindle',
+    'moves', 'table', 'spindle', 'devices',
 }
+# The drivers that a session can start; what their backends are is the drivers' affair.
+_DRIVERS = ('gauges', 'cnc')
+# Who starts the NC programs: a person, or the session; the latter goes on after their first stop
+# (M0) where that is wanted.
+BY_HAND, STARTED, UNATTENDED = 'by hand', 'started', 'unattended'
+
+
+@dataclass(frozen=True)
+class Device:
+    """What a driver reads from.
+
+    backend : its name; file : the device file
+    programs : who starts the NC programs, 'by hand', 'started' or 'unattended'
+    """
+
+    backend: str
+    file: Path
+    programs: str = BY_HAND
 
 
 @dataclass(frozen=True)
@@ -57,6 +75,7 @@ class SessionConfig:
     stations : of each rotary axis [rad], outer one first
     speeds, approach : how the axes move between poses, and to the first pose
     table, spindle : bodies that must not touch; None where the file says nothing of them
+    devices : of the drivers 'gauges' and 'cnc'; a driver that is not in it is started elsewhere
     data : the mapping that was read
     """
 
@@ -69,6 +88,7 @@ class SessionConfig:
     approach: Approach
     table: Table | None
     spindle: Spindle | None
+    devices: dict[str, Device]
     data: dict[str, Any]
 
 
@@ -121,7 +141,7 @@ def load_session(path: Path | str, kind: str | None = None) -> SessionConfig:
             raise UserError(f'{path}: setups: {plan.setup}: {error}') from None
     return SessionConfig(
         machine, radius, tuple(plans), kind, stations, _speeds(reader), _approach(reader),
-        _table(reader), _spindle(reader), data,
+        _table(reader), _spindle(reader), _devices(reader, path.parent), data,
     )
 
 
@@ -243,3 +263,24 @@ def _spindle(reader: Reader) -> Spindle | None:
     for key in ('radius_mm', 'distance_mm'):
         section.required(key)
     return Spindle(*(section.number(k, 0.0) * 1e-3 for k in ('radius_mm', 'distance_mm')))
+
+
+def _devices(reader: Reader, folder: Path) -> dict[str, Device]:
+    """The section `devices`, for example gauges: {backend: serial, file: nest.yaml}."""
+    section = reader.section('devices', set(_DRIVERS))
+    devices = {}
+    for name in section.data:
+        known = {'backend', 'file'} | ({'run_programs'} if name == 'cnc' else set())
+        entry = section.section(name, known)
+        for key in ('backend', 'file'):
+            if not (isinstance(entry.required(key), str) and entry.data[key]):
+                raise UserError(f'{entry.where}: {key}: expected a text, got {entry.data[key]!r}')
+        run = entry.data.get('run_programs', False)
+        if run not in (False, True, UNATTENDED):
+            raise UserError(
+                f'{entry.where}: run_programs: expected true, false or {UNATTENDED}, got {run!r}'
+            )
+        programs = {False: BY_HAND, True: STARTED}.get(run, UNATTENDED)
+        file = (folder / entry.data['file']).absolute()
+        devices[name] = Device(entry.data['backend'], file, programs)
+    return devices

@@ -4,7 +4,7 @@ from copy import deepcopy
 
 import numpy as np
 import pytest
-from independent import NMV, SETUPS, B, noisy, static_cycle
+from independent import NMV, SETUPS, B, C, centre, noisy, static_cycle
 from scipy import stats
 
 from rtest_estimation.errors import UserError
@@ -46,12 +46,40 @@ def with_map(b, c):
     return errors
 
 
+def growing_tilt(b, c):
+    """The constants, and a tilt of C that grows with |B|, as a model's effect."""
+    errors = constant(b, c)
+    errors['C'] = {**errors['C'], 'B': 1.4e-5 * abs(b)}
+    return errors
+
+
+def tilt_and_more(b, c):
+    """Besides, C moves axially, which the model does not have."""
+    errors = growing_tilt(b, c)
+    errors['C'] = {**errors['C'], 'Z': 1.5e-6 * np.cos(5 * c)}
+    return errors
+
+
+def tilt_columns(observations, jacobian, fitted):
+    """(n, 3, 1) of the growing tilt, as differences of the plain machine."""
+    step = 1e-6
+    moved = [
+        (centre(*row, {'C': {'B': step * abs(row[3])}}) - centre(*row, {})) / step
+        for row in observations.positions
+    ]
+    return np.array(moved)[:, :, None]
+
+
 def cycles(errors_at, setups=tuple(SETUPS), noise=0.0, rng=None):
     made = [CACHE[errors_at.__name__, s] for s in setups]
     return [noisy(c, noise, rng) for c in made] if noise else deepcopy(made)
 
 
-CACHE = {(e.__name__, s): static_cycle(s, e) for e in (constant, with_map) for s in SETUPS}
+CACHE = {
+    (e.__name__, s): static_cycle(s, e)
+    for e in (constant, with_map, growing_tilt, tilt_and_more)
+    for s in SETUPS
+}
 
 
 def test_noise_free_data_give_the_truth():
@@ -96,6 +124,45 @@ def test_the_map_of_b_is_found_within_its_uncertainty():
         assert np.abs((value - truth) / stddev).max() < 3.8, parameter.symbol
         assert abs(value.sum()) < 1e-12
     assert result.rms == pytest.approx(2.5e-7, rel=0.06)
+
+
+def test_the_effect_of_a_model_is_no_map_of_c():
+    found = []
+    for seed in range(4):
+        rng = np.random.default_rng(40 + seed)
+        result = fit(stack(MACHINE, cycles(growing_tilt, noise=2.5e-7, rng=rng)), tilt_columns)
+        assert not result.joint_inner and not len(result.outliers)
+        assert np.sqrt(np.mean(result.residual**2)) == pytest.approx(2.5e-7, rel=0.06)
+        assert np.abs((result.location.value - VALUES) / result.location.stddev).max() < 4
+        assert result.error_map.significance > 0.01
+        # The same noise on a machine without the effect, identified without the model.
+        rng = np.random.default_rng(40 + seed)
+        plain = fit(stack(MACHINE, cycles(constant, noise=2.5e-7, rng=rng)))
+        found.append((result.inner_map.significance, plain.inner_map.significance))
+    found = np.array(found)
+    # One column more or less among a thousand rows.
+    np.testing.assert_allclose(found[:, 0], found[:, 1], atol=0.1)
+    assert found.min() > 0.01
+
+
+def test_a_map_of_c_beside_the_effects_of_a_model_is_found():
+    rng = np.random.default_rng(44)
+    result = fit(stack(MACHINE, cycles(tilt_and_more, noise=2.5e-7, rng=rng)), tilt_columns)
+    assert result.joint_inner and result.inner_map.significance < 1e-6
+    truth = np.zeros_like(result.inner_map.value)
+    truth[2] = 1.5e-6 * np.cos(5 * C)
+    z = (result.inner_map.value - truth) / result.inner_map.stddev
+    assert np.sqrt(np.mean(z**2)) == pytest.approx(1.0, abs=0.15)
+    assert np.abs((result.location.value - VALUES) / result.location.stddev).max() < 4
+
+
+def test_a_model_without_effects_changes_nothing():
+    data = stack(MACHINE, cycles(with_map, noise=2.5e-7, rng=np.random.default_rng(45)))
+    without = fit(data)
+    for columns in (np.zeros((len(data), 3, 0)), np.zeros((len(data), 3, 2))):
+        result = fit(data, lambda *_, columns=columns: columns)
+        np.testing.assert_allclose(result.location.value, without.location.value, atol=1e-12)
+        assert result.rms == pytest.approx(without.rms, rel=1e-3)
 
 
 def test_what_an_r_test_cannot_see_is_named():

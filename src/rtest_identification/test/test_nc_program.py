@@ -33,6 +33,9 @@ def read(program):
         if line.startswith('(MSG,'):
             events.append((len(moves), line[5:-1]))
             continue
+        if line.startswith('(POSE '):
+            events.append((len(moves), line[1:-1]))
+            continue
         if line.startswith(('(', '%', 'O')):
             assert line.isascii() and line.count('(') == line.count(')') <= 1
             continue
@@ -157,6 +160,16 @@ def test_in_tcp_mode_the_linear_words_are_the_sphere_in_the_table_frame(
     assert sum(code == 'G1' for code, _, _ in moves) == len(plan.commands) - 1 + 2
     assert on in modes and modes.index(on) < len(modes) - 1 - modes[::-1].index(off)
     assert modes[-1] == end and dwell in [text for _, text in events]
+    if controller != 'iso':
+        # The switch would cut off the end of the move before it.
+        for switch in (on, off):
+            before = [modes[k - 1] for k, text in enumerate(modes) if text == switch]
+            assert before and set(before) == {'G4 P0.1'}
+
+
+def test_only_the_first_stop_has_a_message_which_somebody_has_to_fetch():
+    for tcp in (False, True):
+        assert written(PLANS[0], tcp=tcp).count('(MSG') == 1
 
 
 def test_tcp_words_of_a_nest_calibration_are_its_steps():

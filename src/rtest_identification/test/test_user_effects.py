@@ -9,7 +9,7 @@ import pytest
 from independent import NMV, SETUPS, noisy, static_cycle
 
 from rtest_estimation.errors import UserError
-from rtest_identification.gap.confusions import confusions
+from rtest_identification.gap.confusions import confusions, described
 from rtest_identification.gap.effects import library
 from rtest_identification.gap.formula import parse_formula
 from rtest_identification.gap.model_file import (
@@ -20,6 +20,7 @@ from rtest_identification.gap.model_file import (
     save_model,
 )
 from rtest_identification.gap.rows import make_rows
+from rtest_identification.gap.separate import separate
 from rtest_identification.gap.units import to_si
 from rtest_identification.gap.user_effects import RESERVED, load_effects
 from rtest_identification.gap.workflow import analyse
@@ -352,6 +353,34 @@ def test_confusions_find_a_twin_and_what_the_base_model_swallows(tmp_path, rows)
     (constant,) = load(tmp_path, one('p*(1 + 0*C)'))
     ((key, cosine),) = confusions(constant, rows, known)
     assert key == 'invisible' and cosine > 0.9998
+
+
+def test_what_the_data_cannot_show_and_what_the_model_has_is_said_in_words(tmp_path, rows):
+    scene = rows.scene
+    known = library(scene)
+    (constant,) = load(tmp_path, one('p*(1 + 0*C)'))
+    assert described(constant, rows, known).startswith('these data cannot show mine/C: ')
+    (own,) = load(tmp_path, one('p*cos(8*C)*sin(3*B)'))
+    assert described(own, rows, known) is None
+    (twin,) = load(tmp_path, one('p*cos(2*C)'))
+    assert described(twin, rows, known).startswith('mine/C looks like radial/C.2 (1.000)')
+    (radial,) = [effect for effect in known if effect.key == 'radial/C.2']
+    modelled = make_rows(scene.observations, 0, dict.fromkeys(SETUPS, NEST), [(radial, ())])
+    assert described(twin, modelled, known).startswith('mine/C is already in the model')
+    assert described(constant, modelled, known).startswith('these data cannot show mine/C: ')
+
+
+def test_an_effect_written_again_is_the_same_effect(tmp_path, rows):
+    text = (
+        'effects: [{key: my-scale/X, motions: {E_XX: p*X}, parameters: {p: {unit: um/m}}}, '
+        '{key: bow/X, motions: {E_YX: p*X**2}, parameters: {p: {unit: 1/m}}}]'
+    )
+    scale, bow = load(tmp_path, text)
+    assert separate(rows, scale, ['scale/X'], [scale]) == 'scale/X: the same effect'
+    # What the chain makes alike stays two effects.
+    told = separate(rows, bow, ['straightness/YX', 'angle/CX'], [bow])
+    assert 'straightness/YX: the same effect' in told
+    assert 'angle/CX: no further R-test pose; measure one of the two directly' in told
 
 
 def session(errors_at, seed):

@@ -1,4 +1,4 @@
-"""Stamps: of this host's clock, and of a device's clock brought to it."""
+"""A device's clock brought to this host's."""
 
 from __future__ import annotations
 
@@ -6,8 +6,6 @@ import time
 from collections import deque
 from collections.abc import Sequence
 
-# The kernel steers the clock by less than 0.1 %; a larger difference was set.
-_STEP_S = 0.05
 # Samples of one device may come out of order by less.
 _BACK_NS = 200_000_000
 # Over which the shortest way from the device to here is looked for: long enough to meet a message
@@ -40,38 +38,6 @@ class Recent:
         if age > 1.0:
             self._before, self._now = (self._now if age < 2.0 else 0), 0
             self._began += age
-
-
-class HostClock:
-    """The wall clock of this host as it was when the device was opened, going on steadily.
-
-    Where somebody sets the clock meanwhile, stamps go on as before, so that they neither go back
-    nor jump away from those of another driver that was opened before; `problem` says so.
-    """
-
-    def __init__(self) -> None:
-        self._offset = _wall_ahead()
-
-    def now(self) -> int:
-        """The time [ns]."""
-        return time.monotonic_ns() + self._offset
-
-    def problem(self) -> str:
-        """Whether the clock was set since, in one line; '' where it was not."""
-        step = (_wall_ahead() - self._offset) * 1e-9
-        if abs(step) < _STEP_S:
-            return ''
-        return (
-            f"this host's clock was set by {step:+.3g} s; stamps go on in the time before; start "
-            'the drivers again before the next session'
-        )
-
-
-def _wall_ahead() -> int:
-    """Wall clock minus steady clock [ns]."""
-    before = time.monotonic_ns()
-    wall = time.time_ns()
-    return wall - (before + time.monotonic_ns()) // 2
 
 
 class DeviceClock:

@@ -26,8 +26,9 @@ import time
 from dataclasses import dataclass
 from typing import Any
 
+from rtest_drivers.clock import HostClock
 from rtest_drivers.cnc.axes import AxisSource, names, scales
-from rtest_drivers.cnc.clock import HostClock, Recent
+from rtest_drivers.cnc.clock import Recent
 from rtest_drivers.cnc.device_file import load
 from rtest_drivers.cnc.linuxcnc_line import Line
 from rtest_drivers.cnc.linuxcnc_protocol import (
@@ -101,6 +102,7 @@ class LinuxCnc:
         self._file = load_linuxcnc(address)
         self._names, self._scales = names(self._file.axes), scales(self._file.axes)
         self._joints = [axis.source for axis in self._file.axes]
+        self._clock = HostClock()
         self._line: Line | None = None
         self._watchdog: Watchdog | None = None
         self._state: State | None = None
@@ -120,7 +122,6 @@ class LinuxCnc:
         except BaseException:
             self.close()
             raise
-        self._clock = HostClock()
         self._held: list[Feedback] = []
         self._next = self._changed = time.monotonic()
         self._looked = self._late = -math.inf
@@ -183,6 +184,7 @@ class LinuxCnc:
         return {
             'stamp_uncertainty_ms': f'{self.uncertainty() * 1e3:.3f}',
             'program': known.program if known else '',
+            'estop': 'on' if known and known.estop else 'off',
             'watchdog': 'off' if watchdog is None else watchdog.told(),
         }
 

@@ -17,7 +17,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-from rtest_drivers.cnc.clock import HostClock
+from rtest_drivers.clock import HostClock
 from rtest_drivers.cnc.linuxcnc_line import Line
 from rtest_drivers.cnc.linuxcnc_protocol import Refused, answer
 

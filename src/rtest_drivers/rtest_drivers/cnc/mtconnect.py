@@ -27,8 +27,9 @@ import time
 from dataclasses import dataclass
 from urllib.parse import quote
 
+from rtest_drivers.clock import HostClock
 from rtest_drivers.cnc.axes import AxisSource
-from rtest_drivers.cnc.clock import DeviceClock, HostClock, Recent
+from rtest_drivers.cnc.clock import DeviceClock, Recent
 from rtest_drivers.cnc.device_file import load
 from rtest_drivers.cnc.join import Joiner, Sample
 from rtest_drivers.cnc.mtconnect_agent import Agent
@@ -89,13 +90,14 @@ class MtConnect:
     def __init__(self, address: str) -> None:
         """Read the device file; raises UserError."""
         self._file = load_mtconnect(address)
+        self._host = HostClock()
         self._agent: Agent | None = None
 
     def open(self) -> None:
         """Connect; raises ConnectionError saying what failed and what to do."""
         self.close()
         file = self._file
-        self._host, self._device = HostClock(), DeviceClock()
+        self._device = DeviceClock()
         self._joiner = Joiner(file.axes, file.together)
         self._under_way, self._round_trip = Recent(), Recent()
         self._states: dict[str, str] = {}
@@ -171,6 +173,7 @@ class MtConnect:
             return {}
         offset = self._device.offset
         return {
+            'estop': 'on' if self._states.get(_ESTOP) == 'TRIGGERED' else 'off',
             'clock_offset_ms': '' if offset is None else f'{offset * 1e-6:.1f}',
             'under_way_ms': f'{self._under_way.largest * 1e-6:.1f}',
             'skew_ms': f'{self._joiner.skew.largest * 1e-6:.1f}',

@@ -31,8 +31,9 @@ from dataclasses import dataclass
 from datetime import datetime, timedelta, timezone
 from typing import Any
 
+from rtest_drivers.clock import HostClock
 from rtest_drivers.cnc.axes import AxisSource
-from rtest_drivers.cnc.clock import DeviceClock, HostClock, Recent
+from rtest_drivers.cnc.clock import DeviceClock, Recent
 from rtest_drivers.cnc.device_file import DeviceReader, load
 from rtest_drivers.cnc.join import Joiner, Sample
 from rtest_drivers.cnc.opcua_link import Batch, Link, LinkSettings
@@ -110,12 +111,13 @@ class OpcUa:
     def __init__(self, address: str) -> None:
         """Read the device file; raises UserError."""
         self._file = load_opcua(address)
+        self._host = HostClock()
         self._link: Link | None = None
 
     def open(self) -> None:
         """Connect; raises ConnectionError saying what failed and what to do."""
         self.close()
-        self._host, self._device = HostClock(), DeviceClock()
+        self._device = DeviceClock()
         self._joiner = Joiner(self._file.axes, self._file.together)
         self._bad: dict[str, str] = {}
         # Axes whose first value has come: it may have been sampled long before.
@@ -172,6 +174,7 @@ class OpcUa:
             return {}
         offset = self._device.offset
         return {
+            **({'estop': 'on' if self._estop else 'off'} if self._file.estop is not None else {}),
             'clock_offset_ms': '' if offset is None else f'{offset * 1e-6:.1f}',
             'under_way_ms': f'{self._under_way.largest * 1e-6:.1f}',
             'skew_ms': f'{self._joiner.skew.largest * 1e-6:.1f}',

@@ -9,7 +9,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from rtest_drivers.commands.identify import default_output, recording_name
+from rtest_drivers.commands.identify import folders, recording_name
 
 HELP = 'find the effect that a model lacks'
 OUTPUT = 'gap'
@@ -35,10 +35,8 @@ def run(arguments: argparse.Namespace) -> int:
     from rtest_identification.gap.model_file import load_model
 
     model = load_model(arguments.model) if arguments.model else None
-    several = len(arguments.bags) > 1
-    for bag in arguments.bags:
-        out = arguments.out / recording_name(bag) if arguments.out and several else arguments.out
-        _one(bag, model, arguments, out or default_output(bag, OUTPUT))
+    for bag, out in folders(arguments.bags, arguments.out, OUTPUT):
+        _one(bag, model, arguments, out)
     return 0
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -39,6 +40,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         help='check the uncertainty of the location errors by N random trials')
     parser.add_argument('--model', type=Path, metavar='FILE',
                         help='a model.yaml of `rtest gap`, whose effects are taken out')
+    parser.add_argument('--effects', type=Path, metavar='FILE',
+                        help='effects of your own that the model has')
     parser.add_argument('--out', type=Path, metavar='DIR',
                         help='write to DIR, or to DIR/NAME of each of several recordings')
     parser.add_argument('--topic', action='append', default=[], metavar='ROLE=NAME',
@@ -50,15 +53,39 @@ def run(arguments: argparse.Namespace) -> int:
     """Identify every recording."""
     if arguments.trials and arguments.trials < MIN_TRIALS:
         raise UserError(f'--monte-carlo {arguments.trials}: expected {MIN_TRIALS} trials or more')
-    several = len(arguments.bags) > 1
-    for bag in arguments.bags:
-        out = arguments.out / recording_name(bag) if arguments.out and several else arguments.out
-        options = Options(
-            arguments.machine, _topics(arguments.topic), arguments.tolerance, arguments.priors,
-            arguments.model, arguments.trials,
-        )
+    options = Options(
+        arguments.machine, _topics(arguments.topic), arguments.tolerance, arguments.priors,
+        arguments.model, arguments.trials, arguments.effects,
+    )
+    for bag, out in folders(arguments.bags, arguments.out, OUTPUT):
         identify(bag, out, options)
     return 0
+
+
+def folders(bags: Sequence[Path], out: Path | None, name: str) -> list[tuple[Path, Path]]:
+    """Every recording with the folder for its results.
+
+    out : for one recording, or for a folder of each of several; beside the recordings when
+        omitted, with this name
+
+    Raises UserError where two recordings would share one.
+    """
+    found: list[tuple[Path, Path]] = []
+    taken: dict[Path, Path] = {}
+    for bag in bags:
+        if out is None:
+            folder = default_output(bag, name)
+        else:
+            folder = out / recording_name(bag) if len(bags) > 1 else out
+        place = folder.resolve()
+        if place in taken:
+            raise UserError(
+                f'{taken[place]} and {bag}: both would be written to {folder}; give them one by '
+                'one, with --out'
+            )
+        taken[place] = bag
+        found.append((bag, folder))
+    return found
 
 
 def _topics(chosen: list[str]) -> dict[str, str]:
@@ -86,6 +113,7 @@ class Options:
     priors: Path | None = None
     model: Path | None = None
     trials: int = 0
+    effects: Path | None = None
 
 
 def identify(
@@ -112,7 +140,7 @@ def identify(
     name = recording_name(bag)
     result = identify_recording(
         bag, options.machine, lambda line: quiet or print(f'  {line}', flush=True),
-        options.topics, options.priors, options.model, limits,
+        options.topics, options.priors, options.model, limits, options.effects,
     )
     for line in _missing(result):
         print(f'  missing: {line}')

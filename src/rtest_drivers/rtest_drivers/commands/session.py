@@ -1,7 +1,8 @@
 """Run a session: start the node graph, measure every cycle of the session file, record.
 
-Without --simulate the nodes `gauges` and `cnc` are expected in the ROS graph of this
-machine; with it a simulated machine cell takes their place, on this host only.
+The session file says under `devices` where gauges and CNC are to be reached; --check tries them.
+A driver it does not name is expected in the ROS graph of this machine. With --simulate a simulated
+machine cell takes their place, on this host only.
 """
 
 from __future__ import annotations
@@ -35,6 +36,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         help='name of the session (default: name of the file, date, time)')
     parser.add_argument('--simulate', type=Path, metavar='TRUTH.yaml',
                         help='measure a simulated cell with the errors of this file')
+    parser.add_argument('--check', action='store_true',
+                        help='measure nothing: try every device of the session file and print '
+                        'what answers, rate, jitter, skew, unit, range; status 1 where one fails')
+    parser.add_argument('--moves', action='store_true',
+                        help='with --check: MOVES each axis of a LinuxCNC by 1 mm or 1 deg and '
+                        'back, and says which sign, unit or name is wrong')
     parser.add_argument('--remap', action='append', default=[], metavar='FROM:=TO',
                         help='remap a topic or service in all nodes; may be given several times')
     parser.add_argument('--namespace', default='', metavar='NS',
@@ -57,6 +64,10 @@ def add_run_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Run the session, then identify its recording."""
     config = (arguments.config or config_path('demo.yaml')).absolute()
+    if arguments.moves and not arguments.check:
+        raise UserError('--moves: expected together with --check')
+    if arguments.check:
+        return _check(config, arguments.moves, arguments.simulate)
     settings = GraphSettings(
         config=config,
         session=arguments.session or session_name(config.stem),
@@ -71,6 +82,25 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
+def _check(path: Path, moves: bool, simulate: Path | None) -> int:
+    """Try the devices of a session file; returns the exit status."""
+    from rtest_drivers.device_check import check_session_devices
+    from rtest_drivers.devices import check_devices
+    from rtest_identification.session_file import load_session
+
+    config = load_session(path)
+    if simulate is not None:
+        raise UserError('--check: a simulated cell has no devices to try; leave --simulate out')
+    if not config.devices:
+        raise UserError(f'{path}: devices: missing, --check tries what it names')
+    check_devices(config, path)
+    wrong = check_session_devices(config, moves)
+    for line in wrong:
+        print(f'rtest: {line}', file=sys.stderr)
+    print(f'{shown(path)}: ' + (f'{len(wrong)} found wrong' if wrong else 'every device answers'))
+    return 1 if wrong else 0
+
+
 def measure(
     settings: GraphSettings, domain: int | None, named: bool = False
 ) -> tuple[GraphSettings, bool]:
@@ -81,14 +111,19 @@ def measure(
     Returns the settings with the name the session got, and whether every cycle was measured.
     Raises UserError, NodeFailed, Stopped.
     """
+    from rtest_drivers.devices import check_devices
     from rtest_identification.session_file import load_session
 
     # Mistakes in the files are told before anything is started.
     config = load_session(settings.config)
-    settings = replace(settings, sphere_radius=config.sphere_radius)
+    settings = replace(
+        settings, sphere_radius=config.sphere_radius, devices=config.devices
+    )
     simulated = settings.simulate is not None
     if simulated:
         _check_truth(settings.simulate, config.plans)
+    else:
+        check_devices(config, settings.config)
     try:
         with held_domain(simulated, domain, settings.namespace) as number:
             settings = _reserve(settings, named)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rtest_drivers.cnc.clock import HostClock
+from rtest_drivers.clock import HostClock
 from rtest_drivers.gauges.align import Sample
 from rtest_drivers.gauges.config import ControllerConfig, NestConfig
 from rtest_drivers.gauges.controller import Controller

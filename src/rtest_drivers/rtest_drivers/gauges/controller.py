@@ -7,7 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 
-from rtest_drivers.cnc.clock import HostClock
+from rtest_drivers.clock import HostClock
 from rtest_drivers.gauges.align import Sample
 from rtest_drivers.gauges.config import ControllerConfig
 from rtest_drivers.gauges.frames import (

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from rtest_drivers.cnc.clock import HostClock
+from rtest_drivers.clock import HostClock
 from rtest_drivers.gauges.align import Aligner, Sample
 from rtest_drivers.gauges.config import ControllerConfig, load_nest
 from rtest_drivers.gauges.controller import Controller

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from sensor_msgs.msg import JointState
 
-from rtest_drivers.backends import CNC_BACKENDS
+from rtest_drivers.backends import CNC_BACKENDS, CncBackend
 from rtest_drivers.nodes.driver import Driver, run
 from rtest_drivers.rate import Rate
 from rtest_estimation.nodes.publish import header
@@ -53,12 +53,16 @@ class Cnc(Driver):
         stale, self._stale_now = self._stale_now, 0
         text = ''
         if stale:
-            text = f'feedback is stale: {stale} messages in the last second with an old stamp'
+            text = f'feedback is stale: {stale} messages since the last look with an old stamp'
         return text, {
             'rate_hz': self._rate.take(),
             'messages': self._messages,
             'stale': self._stale,
         }
+
+    def told(self, backend: CncBackend) -> tuple[str, dict[str, Any]]:
+        """What the controller says of itself."""
+        return backend.problem(), backend.told()
 
 
 def main(args: list[str] | None = None) -> int:

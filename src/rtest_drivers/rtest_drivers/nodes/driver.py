@@ -25,6 +25,8 @@ from rtest_estimation.nodes.run import run as spin
 # The reading thread looks this often whether it is to end.
 _READ_S = 0.2
 _FIRST_WAIT_S, _LONGEST_WAIT_S = 0.2, 5.0
+# What goes wrong is to be known within a second.
+_REPORT_S = 0.5
 _SUCCESS, _FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
 
 
@@ -43,13 +45,13 @@ class Driver(Node):
         super().__init__(name)
         self._backends = backends
         self._parameter('backend', 'cell', f'where the data come from, one of {sorted(backends)}')
-        self._parameter('address', DEFAULT_ADDRESS, 'of the device; a socket for the backend cell')
+        self._parameter('address', DEFAULT_ADDRESS, 'device file; of the backend cell, a socket')
         self._parameter('silence_s', 2.0, 'time without data that is reported as an error [s]')
         self._publisher = self.create_lifecycle_publisher(message, topic, STREAM)
         self._diagnostics = diagnostics.Diagnostics(self)
         # Not in ROS time: the clock may come from the very device that is lost.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._timer = self.create_timer(1.0, self._report, clock=steady)
+        self._timer = self.create_timer(_REPORT_S, self._report, clock=steady)
         self._lock = threading.Lock()
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
@@ -71,7 +73,11 @@ class Driver(Node):
 
     @abstractmethod
     def health(self) -> tuple[str, dict[str, Any]]:
-        """A warning, or '' where all is well, and the counts to show. Called once a second."""
+        """A warning, or '' where all is well, and the counts to show, since the last call."""
+
+    @abstractmethod
+    def told(self, backend: Any) -> tuple[str, dict[str, Any]]:
+        """What the backend says of its device: a problem, or '', and what to show."""
 
     # --- life cycle ---
 
@@ -172,20 +178,29 @@ class Driver(Node):
         if text != self._problem:
             self.get_logger().error(text)
         self._problem = text
+        self._report()
 
     def _report(self) -> None:
         with self._lock:
             state, age = self._state, time.monotonic() - self._received
             warning, values = self.health()
+            backend = self._backend
+            problem, told = self.told(backend) if backend is not None else ('', {})
         level, text = diagnostics.OK, state
         if self._problem:
             level, text = diagnostics.ERROR, self._problem
         elif state == 'active' and age > self.get_parameter('silence_s').value:
             level = diagnostics.ERROR
-            text = f'no data for {age:.1f} s; check that the device runs and its cable'
-        elif state == 'active' and warning:
-            level, text = diagnostics.WARN, warning
-        values = {'state': state, 'age_s': f'{age:.2f}', 'reconnects': self._reconnects, **values}
+            text = problem or (
+                f'no data for {age:.1f} s; check that the device runs and its cable'
+            )
+        elif problem or (state == 'active' and warning):
+            level = diagnostics.WARN
+            text = '; '.join(filter(None, (problem, warning)))
+        values = {
+            'state': state, 'age_s': f'{age:.2f}', 'reconnects': self._reconnects,
+            **values, **told,
+        }
         status = diagnostics.status(f'{self.get_name()}: driver', level, text, values)
         status.hardware_id = self.get_parameter('address').value
         self._diagnostics.publish(status)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from rtest_msgs.msg import GaugeSamples
 
-from rtest_drivers.backends import GAUGE_BACKENDS
+from rtest_drivers.backends import GAUGE_BACKENDS, GaugeBackend
 from rtest_drivers.nodes.driver import Driver, run
 from rtest_drivers.rate import Rate
 from rtest_drivers.sequence import Sequence as Counter
@@ -59,7 +59,8 @@ class Gauges(Driver):
         self._idle += int(idle.sum())
         for status, what in _WHAT.items():
             self._note(what, block.status[~idle] == status)
-        self._note('that are not numbers', ~np.isfinite(block.displacement))
+        good = block.status == Status.VALID
+        self._note('that are not numbers', good & ~np.isfinite(block.displacement))
         return message
 
     def _note(self, what: str, bad: np.ndarray) -> None:
@@ -67,7 +68,7 @@ class Gauges(Driver):
             self._bad.setdefault(what, set()).update(np.flatnonzero(bad.any(axis=0)).tolist())
 
     def health(self) -> tuple[str, dict[str, Any]]:
-        """Gauges with bad readings in the last second, losses."""
+        """Gauges with bad readings since the last call, losses."""
         parts = [
             f'readings of gauge {", ".join(str(index + 1) for index in sorted(which))} {what}'
             for what, which in self._bad.items()
@@ -83,6 +84,10 @@ class Gauges(Driver):
             'losses': counter.losses,
             'device_restarts': counter.restarts,
         }
+
+    def told(self, backend: GaugeBackend) -> tuple[str, dict[str, Any]]:
+        """What the controllers of the nest say."""
+        return backend.health()
 
 
 def main(args: list[str] | None = None) -> int:

@@ -1,5 +1,10 @@
 """Node `session`: wakes the drivers, starts one cycle after the other, closes the recording.
 
+On a real machine somebody starts the NC program of each cycle, or the node does where the session
+file says `run_programs`. A cycle whose program ends before its last pose, as after an E-stop, is
+measured anew. The services `session/repeat` and `session/skip` (std_srvs/Trigger) measure it anew
+at any time, or go on with the next one.
+
 Parameters
 ----------
 config : session file (YAML)
@@ -12,14 +17,17 @@ cycle_timeout : how long a cycle may take [s]; 0 is an estimate from its path
 from __future__ import annotations
 
 import math
+import re
 import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import rclpy
-from diagnostic_msgs.msg import DiagnosticArray
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from lifecycle_msgs.msg import State, Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from rclpy.client import Client
@@ -30,14 +38,21 @@ from rtest_msgs.msg import CyclePlan as CyclePlanMessage
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
+from rtest_drivers.clock import HostClock
+from rtest_drivers.cnc.programs import program_of, start_program
 from rtest_drivers.graph import INCOMPLETE
-from rtest_drivers.schedule import NANOSECONDS, Progress, pose_count
+from rtest_drivers.schedule import NANOSECONDS, STOPPED_S, Progress, pose_count
 from rtest_estimation.errors import UserError
 from rtest_estimation.missing import grouped
 from rtest_estimation.nodes import diagnostics, publish
 from rtest_estimation.nodes.qos import LATCHED, LATCHED_100
 from rtest_estimation.records import CyclePlan, Kind, Missing
-from rtest_identification.session_file import SessionConfig, load_session
+from rtest_identification.session_file import (
+    BY_HAND,
+    UNATTENDED,
+    SessionConfig,
+    load_session,
+)
 
 DRIVERS = ('gauges', 'cnc')
 # Who must not miss the first reading.
@@ -51,11 +66,23 @@ SERVICE_TIMEOUT_S = 120.0
 SETTLE_S = 0.5
 # All nodes of a busy graph are found after this time [s].
 OTHERS_S = 3.0
-PROGRESS_S = 2.0
+# How often progress is told: of a simulated cycle, of a real one [s].
+PROGRESS_S, SLOW_PROGRESS_S = 2.0, 10.0
 # Warnings of these nodes are told at the end, or are our own.
 QUIET = ('identifier', 'session')
 # A simulated clock that stands still this long has lost its cell [s].
 CLOCK_TIMEOUT_S = 30.0
+# An NC program that has ended for so long has left its cycle: the estimator would have finished
+# it by now [s].
+ENDED_S = 5.0
+# The CNC driver tells its state as often, twice over [s].
+HEARD_S = 1.0
+REPEAT, SKIP = 'repeat', 'skip'
+# What the CNC driver says where no NC program runs.
+IDLE = 'IDLE'
+
+
+_NUMBERS = re.compile(r'[\d., ]+')
 
 
 class SessionError(RuntimeError):
@@ -75,7 +102,11 @@ class SessionNode(Node):
         self.simulated = self.declare_parameter('simulated', False).value
         self.ready_timeout = self.declare_parameter('ready_timeout', 30.0).value
         self.cycle_timeout = self.declare_parameter('cycle_timeout', 0.0).value
-        self.config: SessionConfig = load_session(self.declare_parameter('config', '').value)
+        config = self.declare_parameter('config', '').value
+        self.config: SessionConfig = load_session(config)
+        self._folder = Path(config).parent
+        # As the drivers' stamps, so that a clock that is set does not part plan and readings.
+        self._host = HostClock()
 
         self._machine = self.create_publisher(String, 'rtest/machine', LATCHED)
         self._plans = self.create_publisher(CyclePlanMessage, 'rtest/plan', LATCHED_100)
@@ -88,6 +119,8 @@ class SessionNode(Node):
         }
         self._state = {name: self.create_client(GetState, f'{name}/get_state') for name in DRIVERS}
         self._finish = {name: self.create_client(Trigger, f'{name}/finish') for name in FINISHERS}
+        for wish in (REPEAT, SKIP):
+            self.create_service(Trigger, f'~/{wish}', partial(self._on_wish, wish))
 
         self._spinner = SingleThreadedExecutor()
         self._spinner.add_node(self)
@@ -95,13 +128,19 @@ class SessionNode(Node):
         self._cycles: dict[tuple[str, int], Cycle] = {}
         self._nests: dict[str, NestCalibration] = {}
         self._open: dict[tuple[str, int], CyclePlan] = {}
-        self._poses_done: tuple[str, int, int] | None = None
+        self._poses_done: tuple[str, int, int, int] | None = None
         self._feedback_age: float | None = None
         self._finished: dict[str, dict[str, str]] = {}
-        self._complaints: dict[str, tuple[int, set[str]]] = {}
+        self._complaints: dict[tuple[str, str], tuple[int, str]] = {}
         self._problems: list[str] = []
         self._status = 'waiting for the other nodes'
         self._cycle_number = 0
+        self._wish = ''
+        # What each driver last said, and the state of the NC program: since when it has not run.
+        self._said: dict[str, str] = {}
+        self._heard = 0
+        self._program: str | None = None
+        self._tells_program, self._ran, self._ended = False, False, math.nan
 
     # ---- the session, step by step ----
 
@@ -124,7 +163,8 @@ class SessionNode(Node):
         started = {}
         for number, plan in enumerate(self.config.plans, 1):
             self._cycle_number = number
-            started[plan.cycle] = self._measure(plan)
+            measure = self._measure if self.simulated else self._measure_on_machine
+            started[plan.cycle] = measure(plan)
         self._status = 'finishing'
         self._close()
         self._judge(started)
@@ -192,26 +232,22 @@ class SessionNode(Node):
                 raise SessionError(f'driver {driver} is {answer.current_state.label}; restart it')
             transition, word = steps[state]
             if not self._transition(driver, transition):
-                raise SessionError(f'driver {driver} could not be {word}; its log says why')
+                self.wait(lambda: bool(self._said.get(driver)), HEARD_S)
+                why = self._said.get(driver, '') or 'its log says why'
+                raise SessionError(f'driver {driver} could not be {word}: {why}')
 
     def _transition(self, driver: str, transition: int) -> bool:
         request = ChangeState.Request(transition=Transition(id=transition))
         return self._call(self._change[driver], request, f'{driver}/change_state').success
 
-    def _measure(self, plan: CyclePlan) -> tuple[str, int]:
-        """Publish one plan and wait for its finished cycle; returns the cycle's key.
+    def _measure(self, plan: CyclePlan) -> list[tuple[str, int]]:
+        """Publish one plan and wait for its finished cycle; returns its key.
 
         Goes on where the cycle has stopped; it is then finished by the next plan or at the end.
         """
-        stamp = self._now()
-        key = (plan.cycle, stamp)
-        self._status = f'measuring {plan.cycle}'
-        self._poses_done = self._feedback_age = None
-        self._open[key] = plan
-        started = replace(plan, session=self.session, stamp=stamp)
-        self._plans.publish(publish.cycle_plan(started))
+        key = self._start(plan)
         shown, told = time.monotonic(), 0
-        progress = Progress(plan, stamp, shown, self.cycle_timeout)
+        progress = Progress(plan, key[1], shown, self.cycle_timeout)
         while key not in self._cycles:
             self.wait(lambda: key in self._cycles, 0.2)
             self._tell_finished()
@@ -221,8 +257,7 @@ class SessionNode(Node):
                                    f'{CLOCK_TIMEOUT_S:.0f} s; is the simulated cell running?')
             if key in self._cycles:
                 break
-            cycle, done, poses = self._poses_done or ('', 0, 0)
-            done = done if cycle == plan.cycle else 0
+            done, poses = self._progress(key)
             if why := progress.stopped(now, wall, done, self._feedback_age):
                 self.get_logger().warning(f'{plan.cycle}: {why}')
                 self._say_cycle(plan, f'{why}; going on')
@@ -230,7 +265,112 @@ class SessionNode(Node):
             if wall - shown > PROGRESS_S and told < done < poses:
                 shown, told = wall, done
                 self._say_cycle(plan, f'{done} of {poses} poses')
+        return [key]
+
+    def _measure_on_machine(self, plan: CyclePlan) -> list[tuple[str, int]]:
+        """Measure a cycle whose NC program runs on a real machine; the keys of all attempts.
+
+        Waits as long as it takes until somebody starts the program.
+        """
+        device = self.config.devices.get('cnc')
+        by_hand = device is None or device.programs == BY_HAND
+        keys = []
+        while True:
+            self._wait_for_end_of_program(plan)
+            self._wish = ''
+            keys.append(self._start(plan))
+            if not by_hand:
+                # Once: after an E-stop only a person starts a machine again.
+                by_hand = not self._start_program(plan)
+            if by_hand:
+                self._say_cycle(plan, f'start {self._program_name(plan)}')
+            by_hand = True
+            again = self._follow(plan, keys[-1])
+            if not again:
+                return keys
+
+    def _follow(self, plan: CyclePlan, key: tuple[str, int]) -> bool:
+        """Wait for a cycle on a real machine; whether it is to be measured anew."""
+        shown, told, complained = time.monotonic(), 0, False
+        progress = Progress(plan, key[1], shown, self.cycle_timeout, attended=True)
+        while key not in self._cycles and not self._wish:
+            self.wait(lambda: key in self._cycles or bool(self._wish), 0.2)
+            self._tell_finished()
+            wall = time.monotonic()
+            done, poses = self._progress(key)
+            ran = self._ran if self._tells_program else done > 0
+            if ran and wall - self._ended > ENDED_S and key not in self._cycles:
+                self._say_cycle(
+                    plan, f'{done} of {len(plan.commands)} poses, and the program has ended'
+                    f'{self._why()}; the cycle is measured anew, or call session/skip'
+                )
+                return True
+            why = progress.stopped(self._now(), wall, done, self._feedback_age)
+            if why and not complained:
+                self.get_logger().warning(f'{plan.cycle}: {why}')
+                self._say_cycle(
+                    plan, f'{why}{self._why()}; go on with the program, or call session/repeat to '
+                    'measure the cycle anew, session/skip to leave it'
+                )
+            complained = bool(why)
+            if wall - shown > SLOW_PROGRESS_S and told < done < poses:
+                shown, told = wall, done
+                self._say_cycle(plan, f'{done} of {poses} poses')
+        if self._wish and key not in self._cycles:
+            self._say_cycle(plan, f'{self._wish}, as was asked for')
+        return self._wish == REPEAT
+
+    def _start(self, plan: CyclePlan) -> tuple[str, int]:
+        """Publish a plan; returns the key of its cycle. The one before ends with it."""
+        stamp = self._now()
+        key = (plan.cycle, stamp)
+        self._status = f'measuring {plan.cycle}'
+        self._poses_done = self._feedback_age = None
+        self._ran = False
+        self._open[key] = plan
+        self._plans.publish(
+            publish.cycle_plan(replace(plan, session=self.session, stamp=stamp))
+        )
         return key
+
+    def _progress(self, key: tuple[str, int]) -> tuple[int, int]:
+        """Poses of the cycle that were reached so far, and all of them."""
+        cycle, stamp, done, poses = self._poses_done or ('', 0, 0, 0)
+        return (done, poses) if (cycle, stamp) == key else (0, poses)
+
+    def _wait_for_end_of_program(self, plan: CyclePlan) -> None:
+        """The program of the cycle before still moves the sphere out of the nest."""
+        heard = self._heard
+        self.wait(lambda: self._heard > heard + 1, 2.0 * HEARD_S)
+        if self._program in (None, IDLE):
+            return
+        self._status = 'waiting for the end of the NC program'
+        if not self.wait(lambda: self._program in (None, IDLE), STOPPED_S):
+            self._say_cycle(plan, 'the program before still runs; end it')
+            self.wait(lambda: self._program in (None, IDLE), math.inf)
+
+    def _start_program(self, plan: CyclePlan) -> bool:
+        """Start the program of a cycle; False where it has to be started by hand."""
+        device, program = self.config.devices['cnc'], program_of(plan.cycle, self._folder)
+        unattended = device.programs == UNATTENDED
+        try:
+            start_program(str(device.file), program.absolute(), unattended)
+        except (UserError, ConnectionError) as error:
+            self._say_cycle(plan, str(error))
+            return False
+        waits = '' if unattended else '; when the sphere is clear of the nest let it go on'
+        self._say_cycle(plan, f'{program.name} started: {len(plan.commands)} poses{waits}')
+        return True
+
+    def _program_name(self, plan: CyclePlan) -> str:
+        """For example `program 1a-static.ngc: 86 poses`."""
+        program = program_of(plan.cycle, self._folder)
+        name = f'program {program.name}' if program else f'the NC program of {plan.cycle}'
+        return f'{name}: {len(plan.commands)} poses'
+
+    def _why(self) -> str:
+        said = self._said.get('cnc', '')
+        return f' ({said})' if said else ''
 
     def _tell_finished(self) -> None:
         """Tell the outcome of every cycle that has come, also of one that had stopped before."""
@@ -238,6 +378,7 @@ class SessionNode(Node):
             if key in self._cycles:
                 del self._open[key]
                 self._say_cycle(plan, self._outcome(plan, self._cycles[key]))
+                self._finished.pop(plan.cycle, None)
 
     def _outcome(self, plan: CyclePlan, cycle: Cycle) -> str:
         text = pose_count(len(plan.commands), len(cycle.points), len(cycle.missing))
@@ -260,12 +401,12 @@ class SessionNode(Node):
             text += f', residual {nest.residual * 1e6:.2f} µm' if nest else ', no calibration'
         return text
 
-    def _judge(self, started: dict[str, tuple[str, int]]) -> None:
+    def _judge(self, started: dict[str, list[tuple[str, int]]]) -> None:
         """A cycle that says nothing is a problem; single missing poses are not."""
         lost = [
-            name for name, key in started.items()
+            name for name, keys in started.items()
             # Displacements count from the first point: alone it is zero.
-            if key not in self._cycles or len(self._cycles[key].points) < 2
+            if not any(key in self._cycles and len(self._cycles[key].points) > 1 for key in keys)
         ]
         if lost:
             self._problem(f'incomplete: nothing was measured in {", ".join(lost)}')
@@ -310,7 +451,7 @@ class SessionNode(Node):
         return future.result()
 
     def _now(self) -> int:
-        return self.get_clock().now().nanoseconds
+        return self.get_clock().now().nanoseconds if self.simulated else self._host.now()
 
     def say(self, text: str) -> None:
         """One line of progress for the person who waits."""
@@ -341,24 +482,56 @@ class SessionNode(Node):
         for status in message.status:
             values = {pair.key: pair.value for pair in status.values}
             if status.name == 'estimator: cycle':
-                if {'cycle', 'poses_done', 'poses'} <= values.keys():
-                    done, poses = int(values['poses_done']), int(values['poses'])
-                    self._poses_done = (values['cycle'], done, poses)
+                if {'cycle', 'started', 'poses_done', 'poses'} <= values.keys():
+                    numbers = (int(values[key]) for key in ('started', 'poses_done', 'poses'))
+                    self._poses_done = (values['cycle'], *numbers)
                 age = values.get('feedback_age_s')
                 self._feedback_age = math.inf if age is None else float(age)
             elif status.name == 'estimator: finished cycle':
                 self._finished[status.message.partition(':')[0]] = values
                 continue
-            # Once per cycle: a message may carry numbers that change every second. And not again
-            # where nothing has changed since.
+            self._note_driver(status, values)
             source = status.name.strip('/').split(':')[0]
             worse = status.level in (diagnostics.WARN, diagnostics.ERROR)
-            if worse and source not in QUIET:
-                cycle, told = self._complaints.get(source, (-1, set()))
-                new = [part for part in status.message.split('; ') if part not in told]
-                if cycle != self._cycle_number and new:
-                    self._complaints[source] = (self._cycle_number, told | set(new))
-                    self.say(f'{source}: {"; ".join(new)}')
+            if worse and source not in QUIET and self._is_new(source, status.message):
+                self.say(f'{source}: {status.message}')
+
+    def _is_new(self, source: str, text: str) -> bool:
+        """Whether a complaint is to be told: once per cycle, and not again while it is the same.
+
+        It may carry numbers that change every second.
+        """
+        kind = _NUMBERS.sub('', text)
+        cycle, last = self._complaints.get((source, kind), (-1, ''))
+        if cycle == self._cycle_number or text == last:
+            return False
+        self._complaints[source, kind] = (self._cycle_number, text)
+        return True
+
+    def _note_driver(self, status: DiagnosticStatus, values: dict[str, str]) -> None:
+        """What a driver says, and whether an NC program runs."""
+        name = status.name.rpartition('/')[2].partition(':')[0]
+        if name not in DRIVERS:
+            return
+        self._said[name] = '' if status.level == diagnostics.OK else status.message
+        if name != 'cnc':
+            return
+        self._heard += 1
+        program = values.get('program') or None
+        self._tells_program |= program is not None
+        if program is None and values.get('estop') == 'on':
+            program = IDLE
+        if program is not None and program != IDLE:
+            self._ran, self._ended = True, math.nan
+        elif self._program != program:
+            self._ended = time.monotonic() if program == IDLE else math.nan
+        self._program = program
+
+    def _on_wish(
+        self, wish: str, _: Trigger.Request, response: Trigger.Response
+    ) -> Trigger.Response:
+        self._wish, response.success, response.message = wish, True, self._status
+        return response
 
     def _diagnose(self) -> None:
         level = diagnostics.WARN if self._problems else diagnostics.OK

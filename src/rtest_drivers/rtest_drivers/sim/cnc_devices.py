@@ -30,7 +30,9 @@ class LinuxCncServer:
     late : time before every answer [s]; half : answers without their end
     """
 
-    def __init__(self, password: str = 'EMC', enable_password: str = 'EMCTOO') -> None:
+    def __init__(
+        self, password: str = 'EMC', enable_password: str = 'EMCTOO', port: int = 0
+    ) -> None:
         self.password, self.enable_password = password, enable_password
         self.position: Sequence[float] = [0.0] * 6
         self.units = 'MM MM MM DEG DEG MM'
@@ -40,8 +42,7 @@ class LinuxCncServer:
         self.in_control: socket.socket | None = None
         self.requests: deque[str] = deque(maxlen=1000)
         self._clients: set[socket.socket] = set()
-        self._server = socketserver.ThreadingTCPServer((HOST, 0), self._handler())
-        self._server.daemon_threads = True
+        self._server = _TcpServer((HOST, port), self._handler())
         self.port: int = self._server.server_address[1]
         self._thread = threading.Thread(target=self._server.serve_forever, args=(0.05,))
         self._thread.start()
@@ -133,6 +134,11 @@ class LinuxCncServer:
             time.sleep(0.01)
         time.sleep(0.1)
         return True
+
+
+class _TcpServer(socketserver.ThreadingTCPServer):
+    allow_reuse_address = True
+    daemon_threads = True
 
 
 class OpcUaServer:

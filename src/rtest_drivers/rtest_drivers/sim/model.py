@@ -1,8 +1,8 @@
 """Effects of a model file as error motions of the simulated machine.
 
-What an effect of the library is, the library says; here it is only evaluated. Effects that hang on
-time, on the direction of motion or on the instrument are no functions of the position and are
-refused.
+What an effect is, the library or the user's file of effects says; here it is only evaluated.
+Effects that hang on time, on the direction of motion or on the instrument are no functions of the
+position and are refused.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from rtest_estimation.errors import UserError
 from rtest_identification.gap.effects import Effect, library
 from rtest_identification.gap.model_file import load_model
 from rtest_identification.gap.scene import Scene
+from rtest_identification.gap.user_effects import RESERVED, load_effects, of_positions
 from rtest_identification.machine import Machine
 from rtest_identification.observations import Observations
 
@@ -52,20 +53,37 @@ class ModelMotions:
         return total[:, place : place + 6]
 
 
-def load_motions(path: Path, machine: Machine) -> ModelMotions:
+def load_motions(
+    path: Path, machine: Machine, effects_path: Path | None = None
+) -> ModelMotions:
     """Read a model file for the simulation.
+
+    effects_path : file of the user's own effects that the model has
 
     Raises UserError naming file, effect and what is expected.
     """
     model = load_model(path)
-    known: dict[str, Effect] = {}
+    if model.machine and model.machine != machine.name:
+        raise UserError(
+            f'{path}: model {model.name!r} is of machine {model.machine!r}, the simulated one is '
+            f'{machine.name!r}; give the model of this machine'
+        )
+    more = load_effects(effects_path, machine) if effects_path else []
+    moving = {effect.key for effect in more if not of_positions(effect)}
+    known = {effect.key: effect for effect in more}
+    for entry in model.effects:
+        if entry.key not in known and entry.key.split('/')[0] not in RESERVED:
+            raise UserError(
+                f'{path}: no effect {entry.key!r} in the library; if it is your own, give its '
+                'file as effects: beside model: in the truth file'
+            )
     for reach in (_SWIVEL, np.pi):
         ends = {name: np.array([-reach, reach]) for name in machine.letters}
         known |= {effect.key: effect for effect in library(_scene(machine, ends))}
     terms = []
     for entry, (effect, shape) in zip(model.effects, model.resolve(list(known.values())),
                                       strict=True):
-        if entry.key.split('/')[0] in NOT_SIMULATED:
+        if entry.key.split('/')[0] in NOT_SIMULATED or entry.key in moving:
             raise UserError(f'{path}: {entry.key}: not a function of the axes, not simulated')
         names = [p.name for p in effect.parameters]
         if sorted(entry.parameters) != sorted(names):

@@ -55,7 +55,7 @@ class Truth:
 
 
 def load_truth(path: Path | str) -> Truth:
-    """Read a truth file; `machine` and `model` in it are relative to the file.
+    """Read a truth file; `machine`, `model` and `effects` in it are relative to the file.
 
     Raises UserError naming file, key and what is expected.
     """
@@ -64,9 +64,12 @@ def load_truth(path: Path | str) -> Truth:
     machine = load_machine(path.parent / str(fields.raw('machine')))
     gauges = _gauges(fields.section('gauges'))
     errors = parse_errors(fields, machine)
-    model = fields.raw('model', None)
+    model, effects = fields.raw('model', None), fields.raw('effects', None)
     if model is not None:
-        errors = replace(errors, model=load_motions(path.parent / str(model), machine))
+        own = path.parent / str(effects) if effects is not None else None
+        errors = replace(errors, model=load_motions(path.parent / str(model), machine, own))
+    elif effects is not None:
+        raise UserError(f'{path}: effects: they are those of a model; expected model: beside it')
     truth = Truth(
         machine=machine,
         errors=errors,

@@ -4,20 +4,17 @@ from __future__ import annotations
 
 import difflib
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import yaml
 
 from rtest_estimation.errors import UserError
 from rtest_identification.gap.catalogue import every_effect
-from rtest_identification.gap.effects import Effect, library
-from rtest_identification.gap.scene import Scene
+from rtest_identification.gap.effects import Effect
 from rtest_identification.machine import Machine
-from rtest_identification.observations import Observations
 from rtest_identification.symbols import ErrorParameter, location_parameters
 
 _KEYS = {'name', 'machine', 'values', 'effects'}
@@ -104,7 +101,8 @@ class Model:
                 near = difflib.get_close_matches(entry.key, known, 3)
                 hint = f'; did you mean {", ".join(near)}?' if near else ''
                 raise UserError(
-                    f'model {self.name!r}: no effect {entry.key!r} for this machine{hint}'
+                    f'model {self.name!r}: no effect {entry.key!r} for this machine{hint}; '
+                    'if it is your own, give it with --effects'
                 )
             names = [p.name for p in effect.shape]
             if sorted(entry.shape) != sorted(names):
@@ -153,25 +151,6 @@ def load_model(path: Path | str) -> Model:
         _values(data.get('values') or {}, f'{path}: values'),
         tuple(_effect(entry, f'{path}: effects[{n}]') for n, entry in enumerate(effects)),
     )
-
-
-def model_columns(
-    model: Model, start: int, directions: Mapping[str, np.ndarray]
-) -> Callable[[Observations, np.ndarray, np.ndarray], np.ndarray]:
-    """The model's effects as columns for `location.fit`.
-
-    start : of the session [ns]; directions : of the gauges by set-up
-    """
-
-    def columns(
-        observations: Observations, jacobian: np.ndarray, fitted: np.ndarray
-    ) -> np.ndarray:
-        scene = Scene(observations, jacobian, fitted, start, directions)
-        chosen = model.resolve(library(scene))
-        empty = np.zeros((len(observations), 3, 0))
-        return np.concatenate([empty, *(e.columns(scene, s) for e, s in chosen)], axis=2)
-
-    return columns
 
 
 def save_model(model: Model, path: Path) -> None:

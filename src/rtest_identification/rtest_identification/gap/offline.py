@@ -12,7 +12,7 @@ import numpy as np
 from rtest_estimation.bagfile import read_bag
 from rtest_estimation.recording import TYPES, recording_of, temperatures
 from rtest_estimation.records import Cycle
-from rtest_identification.gap.confusions import confusions
+from rtest_identification.gap.confusions import described
 from rtest_identification.gap.effects import Effect, library
 from rtest_identification.gap.model_file import Model, ModelEffect, Value
 from rtest_identification.gap.rows import nest_spread
@@ -68,12 +68,9 @@ def gap_recording(
     directions = {f.nest.setup: f.nest.direction for f in finished if f.nest is not None}
     progress('comparing model and measurement')
     session = gap_session(machine, [f.cycle for f in finished], directions, model, more)
-    alike = []
-    for effect in more:
-        found = confusions(effect, session.result.rows, library(session.result.rows.scene))
-        if found:
-            names = ', '.join(f'{key} ({cosine:.3f})' for key, cosine in found)
-            alike.append(f'{effect.key} looks like {names} in these data (cosine)')
+    known = library(session.result.rows.scene)
+    told = (described(effect, session.result.rows, known) for effect in more)
+    alike = [line for line in told if line]
     planned = sum(len(f.cycle.plan.commands) for f in finished)
     missing = sum(len(f.cycle.missing) for f in finished)
     if missing:

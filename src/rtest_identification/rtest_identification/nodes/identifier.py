@@ -10,6 +10,7 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from rtest_estimation import messages
+from rtest_estimation.attempts import counted
 from rtest_estimation.errors import UserError
 from rtest_estimation.nodes import diagnostics
 from rtest_estimation.nodes.qos import LATCHED, LATCHED_100
@@ -30,7 +31,7 @@ class IdentifierNode(Node):
     def __init__(self) -> None:
         super().__init__('identifier')
         self._machine: Machine | None = None
-        self._cycles: dict[str, CycleRecord] = {}
+        self._cycles: list[CycleRecord] = []
         self._result: Identification | None = None
         self._problem = 'waiting for the machine'
         self._location = self.create_publisher(LocationErrors, 'rtest/location_errors', LATCHED)
@@ -50,7 +51,7 @@ class IdentifierNode(Node):
         try:
             self._machine = parse_machine(message.data, 'rtest/machine')
             self._problem = 'waiting for a static cycle'
-            if any(c.plan.kind is Kind.STATIC for c in self._cycles.values()):
+            if any(c.plan.kind is Kind.STATIC for c in self._cycles):
                 self._identify()
         except UserError as error:
             self._machine, self._problem = None, str(error)
@@ -62,10 +63,10 @@ class IdentifierNode(Node):
         except messages.MessageError as error:
             self.get_logger().error(f'rtest/cycle: {error}')
             return
-        if any(c.plan.session != cycle.plan.session for c in self._cycles.values()):
+        if any(c.plan.session != cycle.plan.session for c in self._cycles):
             self._cycles.clear()
             self._result = None
-        self._cycles[cycle.plan.cycle] = cycle
+        self._cycles = counted([*self._cycles, cycle])
         if cycle.plan.kind is Kind.STATIC:
             self._identify()
 
@@ -77,13 +78,13 @@ class IdentifierNode(Node):
         if self._machine is None:
             return
         try:
-            result = identify(self._machine, tuple(self._cycles.values()))
+            result = identify(self._machine, tuple(self._cycles))
         except UserError as error:
             self._problem = str(error)
             self.get_logger().warning(str(error))
             return
         self._result, self._problem = result, ''
-        stamp = max(cycle.stamp for cycle in self._cycles.values())
+        stamp = max(cycle.stamp for cycle in self._cycles)
         self._location.publish(publish.location_errors(result, stamp))
         for axis_map in result.maps:
             self._map.publish(publish.error_map(result, axis_map, stamp))
@@ -100,7 +101,7 @@ class IdentifierNode(Node):
 
     def _find_gap(self) -> str:
         """Compare model and measurement, publish what was found, and sum it up."""
-        cycles = tuple(self._cycles.values())
+        cycles = tuple(self._cycles)
         directions = {
             cycle.plan.setup: self._directions[cycle.calibration]
             for cycle in cycles

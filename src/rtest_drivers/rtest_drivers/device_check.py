@@ -1,0 +1,144 @@
+"""Tries the devices of a session file: what answers, how often, how evenly, with what."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+
+from rtest_drivers.cnc.check import CncCheck, check
+from rtest_drivers.cnc.linuxcnc import LinuxCnc, load_linuxcnc
+from rtest_drivers.cnc.linuxcnc_control import Control, make_moves
+from rtest_drivers.cnc.sense import Move, judge
+from rtest_drivers.devices import BACKENDS
+from rtest_drivers.gauges.check import ChannelCheck, ControllerCheck, check_nest
+from rtest_drivers.gauges.config import load_nest
+from rtest_estimation.dwell import ROTARY_LETTERS
+from rtest_estimation.errors import UserError
+from rtest_estimation.records import Status
+from rtest_identification.session_file import Device, SessionConfig
+
+SECONDS = 2.0
+# A device that gives less than this part of the readings asked for is too slow for its settings.
+_FEWEST = 0.8
+# How far each axis is moved for the check of its sense [m], [rad].
+_MOVE = (1e-3, math.radians(1.0))
+
+
+def check_session_devices(
+    config: SessionConfig, moves: bool = False, say: Callable[[str], None] = print
+) -> list[str]:
+    """Try every device for some seconds and print what it does; returns what is wrong.
+
+    moves : also move each axis of a LinuxCNC by 1 mm or 1 deg and back, and judge its feedback
+
+    Raises UserError for mistakes in the device files.
+    """
+    wrong = []
+    for name, device in config.devices.items():
+        lines, problems = (_gauges if name == 'gauges' else _cnc)(device)
+        if name == 'cnc' and moves and not problems:
+            more, problems = _moves(device)
+            lines += more
+        for line in lines:
+            say(line)
+        wrong += problems
+    return wrong
+
+
+def _gauges(device: Device) -> tuple[list[str], list[str]]:
+    found = check_nest(load_nest(device.file), SECONDS)
+    lines = [
+        f'gauges: {device.file}',
+        f'  {"port, protocol":36} {"answers":>7} {"rate [1/s]":>12} {"jitter":>8} {"longest":>8} '
+        f'{"skew":>8} {"stamp":>8}  unit, range',
+    ]
+    problems = []
+    for one in found:
+        limits = 'any'
+        if one.limits is not None:
+            limits = f'{one.limits[0] * 1e3:g} to {one.limits[1] * 1e3:g} mm'
+        lines.append(
+            f'  {one.port + ", " + one.protocol:36} {"no" if one.problem else "yes":>7} '
+            f'{f"{_number(one.rate, 1)} of {one.wanted_rate:g}":>12} {_ms(one.interval_std):>8} '
+            f'{_ms(one.interval_max):>8} {_ms(one.skew_max):>8} {_ms(one.stamp_uncertainty):>8}'
+            f'  {one.unit}, {limits}'
+        )
+        lines += [_channel(channel) for channel in one.channels]
+        problems += _controller_problems(one)
+    return lines, problems
+
+
+def _channel(one: ChannelCheck) -> str:
+    status = 'no reading' if one.status is None else one.status.name.lower().replace('_', ' ')
+    value = '' if math.isnan(one.last) else f', {one.last * 1e3:+.4f} mm'
+    noise = '' if math.isnan(one.noise) else f', noise {one.noise * 1e6:.2f} µm'
+    return f'    gauge {one.channel}: {status}{value}{noise}'
+
+
+def _controller_problems(one: ControllerCheck) -> Iterator[str]:
+    where = f'gauges: {one.port}'
+    if one.problem:
+        yield f'gauges: {one.problem}'
+    elif any(channel.status is Status.DEVICE_ERROR for channel in one.channels):
+        yield f'{where}: {one.note}'
+    elif not one.rate > _FEWEST * one.wanted_rate:
+        yield (
+            f'{where}: {_number(one.rate, 1)} readings a second instead of {one.wanted_rate:g}; '
+            'set a lower rate_hz, or a higher baud rate at both ends'
+        )
+
+
+def _cnc(device: Device) -> tuple[list[str], list[str]]:
+    found = check(BACKENDS['cnc'][device.backend](str(device.file)), SECONDS)
+    lines = [
+        f'cnc: {device.backend}, {device.file}',
+        f'  {"answers":>7} {"rate [1/s]":>12} {"jitter":>8} {"longest":>8} {"stamp":>8}',
+        f'  {"yes" if found.answers else "no":>7} {_number(found.rate, 1):>12} '
+        f'{_ms(found.jitter):>8} {_ms(found.gap):>8} {_ms(found.uncertainty):>8}',
+    ]
+    lines += _positions(found)
+    lines += [f'    {key}: {value}' for key, value in (found.told or {}).items() if value]
+    return lines, [f'cnc: {found.problem}'] if found.problem else []
+
+
+def _positions(found: CncCheck) -> Iterator[str]:
+    for name, value in (found.position or {}).items():
+        if name in ROTARY_LETTERS:
+            yield f'    {name} {math.degrees(value):12.5f} deg'
+        else:
+            yield f'    {name} {value * 1e3:12.5f} mm'
+    if found.frozen:
+        yield '    nothing moved; --moves tells whether these are positions of the axes'
+
+
+def _moves(device: Device) -> tuple[list[str], list[str]]:
+    """Every axis a little and back: sign, unit and name of its feedback."""
+    if device.backend != 'linuxcnc':
+        raise UserError(
+            f'--moves: only the backend linuxcnc can be moved, not {device.backend}; move each '
+            'axis by hand and watch the topic rtest/cnc/feedback'
+        )
+    file = load_linuxcnc(str(device.file))
+    asked = [Move(axis.name, _MOVE[axis.name in ROTARY_LETTERS]) for axis in file.axes]
+    backend, control = LinuxCnc(str(device.file)), Control(file)
+    try:
+        backend.open()
+        control.open()
+        findings = judge(file.axes, asked, make_moves(control, backend, asked))
+    except (ConnectionError, UserError) as error:
+        return [], [f'cnc: {error}']
+    finally:
+        control.close()
+        backend.close()
+    return [f'    {one.text}' for one in findings], [
+        f'cnc: {device.file}: {one.text}' for one in findings if one.kind != 'right'
+    ]
+
+
+def _ms(seconds: float) -> str:
+    return '' if math.isnan(seconds) else f'{seconds * 1e3:.2f} ms'
+
+
+def _number(value: float, digits: int) -> str:
+    return '-' if math.isnan(value) else f'{value:.{digits}f}'
+
