@@ -39,7 +39,8 @@ def test_missing_poses_are_named_with_their_reasons(tmp_path):
     cut.write_bytes(data[: len(data) * 9 // 10])
     missing = [line for line in describe(cut) if line.startswith('missing')]
     assert re.fullmatch(r'missing   \d+ of 123 poses', missing[0])
-    assert re.fullmatch(r'missing   centre-static \d+-26: never reached', missing[-1])
+    # How many the cut takes depends on where the file's chunks end.
+    assert re.fullmatch(r'missing   centre-static (\d+-)?26: never reached', missing[-1])
 
 
 def test_a_file_that_is_no_session_is_described_with_the_reason(tmp_path):
