@@ -302,15 +302,15 @@ class SessionNode(Node):
             if ran and wall - self._ended > ENDED_S and key not in self._cycles:
                 self._say_cycle(
                     plan, f'{done} of {len(plan.commands)} poses, and the program has ended'
-                    f'{self._why()}; the cycle is measured anew, or call session/skip'
+                    f'{self._why()}; the cycle is measured anew, or `rtest ask skip`'
                 )
                 return True
             why = progress.stopped(self._now(), wall, done, self._feedback_age)
             if why and not complained:
                 self.get_logger().warning(f'{plan.cycle}: {why}')
                 self._say_cycle(
-                    plan, f'{why}{self._why()}; go on with the program, or call session/repeat to '
-                    'measure the cycle anew, session/skip to leave it'
+                    plan, f'{why}{self._why()}; go on with the program, or `rtest ask repeat` to '
+                    'measure the cycle anew, `rtest ask skip` to leave it'
                 )
             complained = bool(why)
             if wall - shown > SLOW_PROGRESS_S and told < done < poses:
@@ -530,7 +530,13 @@ class SessionNode(Node):
     def _on_wish(
         self, wish: str, _: Trigger.Request, response: Trigger.Response
     ) -> Trigger.Response:
-        self._wish, response.success, response.message = wish, True, self._status
+        # A simulated cycle needs nobody.
+        response.success = bool(self._open) and not self.simulated
+        response.message = self._status
+        if response.success:
+            self._wish = wish
+        else:
+            response.message += '; there is nothing to repeat or skip'
         return response
 
     def _diagnose(self) -> None:
