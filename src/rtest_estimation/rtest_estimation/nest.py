@@ -82,7 +82,8 @@ def calibrate(
     if misfit[worst] > _MISFIT * spread[0] / np.sqrt(count):
         raise CalibrationError(
             f'gauge {worst + 1} does not follow the steps of the sphere, '
-            f'{misfit[worst] * 1e6:.1f} µm are left; does it touch the sphere, is it fixed, is it in its range?'
+            f'{misfit[worst] * 1e6:.1f} µm are left; does it touch the sphere, is it fixed, '
+            'is it in its range?'
         )
     variance = (left**2).sum(axis=0) / (count - 4)
     cofactor = np.linalg.inv(design.T @ design)[:3, :3]
