@@ -30,6 +30,10 @@ class Bag:
     size : of the files [bytes]; start, end : first and last log time [ns], 0 in an empty bag
     closed : whether every file has the index that is written when a recording is closed
     raw : topic to its messages in file order, each with the definition to read it by
+    latched : topic to whether a subscriber that came late got its last messages too; only of
+        topics of which the file says it
+    ordered : whether the log times never go back
+    definitions : topic to the definition of its type
     """
 
     path: Path
@@ -41,6 +45,17 @@ class Bag:
     topics: dict[str, tuple[str, int]]
     warnings: tuple[str, ...]
     raw: dict[str, list[tuple[Definition, bytes]]]
+    latched: dict[str, bool] = field(default_factory=dict)
+    ordered: bool = True
+    definitions: dict[str, Definition] = field(default_factory=dict)
+
+    def stream(self, topics: Collection[str]) -> Iterator[tuple[str, Definition, int, bytes]]:
+        """Topic, definition, log time [ns] and data of every message, in the order of log time.
+
+        Reads the files again, and so needs little memory; all of it where they are not in order.
+        """
+        found = (m for m in _stored(self.files, _Contents(())) if m[0] in topics)
+        return found if self.ordered else iter(sorted(found, key=lambda message: message[2]))
 
     def messages(self, topic: str) -> Iterator[Any]:
         """Deserialised messages of a topic, in file order; a `DamagedMessage` for a damaged one.
@@ -62,9 +77,12 @@ class _Contents:
     start: int = 0
     end: int = 0
     closed: bool = True
-    types: dict[str, str] = field(default_factory=dict)
+    definitions: dict[str, Definition] = field(default_factory=dict)
     counts: Counter[str] = field(default_factory=Counter)
     warnings: list[str] = field(default_factory=list)
+    latched: dict[str, bool] = field(default_factory=dict)
+    ordered: bool = True
+    last: int = 0
     raw: dict[str, list[tuple[Definition, bytes]]] = field(
         default_factory=lambda: defaultdict(list)
     )
@@ -72,8 +90,10 @@ class _Contents:
     def add(self, topic: str, definition: Definition, log_time: int, data: bytes) -> None:
         if definition.type_name in self.keep:
             self.raw[topic].append((definition, data))
-        self.types.setdefault(topic, definition.type_name)
+        self.definitions.setdefault(topic, definition)
         self.counts[topic] += 1
+        self.ordered &= log_time >= self.last
+        self.last = log_time
         self.start = log_time if not self.start else min(self.start, log_time)
         self.end = max(self.end, log_time)
 
@@ -92,16 +112,9 @@ def read_bag(path: str | Path, keep: Collection[str]) -> Bag:
         raise UserError(f'{path}: neither a file nor a directory; expected a recording')
     contents = _Contents(keep)
     try:
-        files, storage = _find_files(path, contents)
-        if storage == 'mcap':
-            for file in files:
-                scan = McapScan(file)
-                for message in scan.messages():
-                    contents.add(*message)
-                contents.closed &= scan.closed
-                contents.warnings += scan.warnings
-        else:
-            _scan_other(files[0], contents)
+        files = _find_files(path, contents)
+        for message in _stored(files, contents):
+            contents.add(*message)
         size = sum(file.stat().st_size for file in files)
     except OSError as error:
         where = error.filename or path
@@ -113,18 +126,54 @@ def read_bag(path: str | Path, keep: Collection[str]) -> Bag:
         contents.start,
         contents.end,
         contents.closed,
-        {name: (contents.types[name], contents.counts[name]) for name in contents.types},
+        {
+            name: (definition.type_name, contents.counts[name])
+            for name, definition in contents.definitions.items()
+        },
         tuple(contents.warnings),
         dict(contents.raw),
+        contents.latched,
+        contents.ordered,
+        contents.definitions,
     )
 
 
-def _find_files(path: Path, contents: _Contents) -> tuple[tuple[Path, ...], str]:
-    """Files of a recording in order, and their storage: ``mcap`` or ``other``."""
+def _stored(
+    files: tuple[Path, ...], contents: _Contents
+) -> Iterator[tuple[str, Definition, int, bytes]]:
+    """Messages of the files in the order in which they are stored.
+
+    contents : takes what else the files say
+    """
+    if any(file.suffix in ('.db3', '.zstd') for file in files):
+        yield from _other(files[0], contents)
+        return
+    for file in files:
+        scan = McapScan(file)
+        yield from scan.messages()
+        contents.closed &= scan.closed
+        contents.warnings += scan.warnings
+        for topic, profiles in scan.offered.items():
+            if (latched := _latched(profiles)) is not None:
+                contents.latched[topic] = latched
+
+
+def _latched(profiles: str) -> bool | None:
+    """Whether any of the publishers' profiles (YAML) is latched; None where there is none."""
+    try:
+        # Older versions of rosbag2 wrote numbers.
+        found = [profile['durability'] for profile in yaml.safe_load(profiles)]
+    except (yaml.YAMLError, KeyError, TypeError):
+        return None
+    return any(durability in ('transient_local', 1) for durability in found)
+
+
+def _find_files(path: Path, contents: _Contents) -> tuple[Path, ...]:
+    """Files of a recording in order."""
     if path.name == 'metadata.yaml':
         path = path.parent
     if path.is_file():
-        return (path,), 'other' if path.suffix in ('.db3', '.zstd') else 'mcap'
+        return (path,)
     listed = _listed_files(path)
     missing = [name for name in listed if not (path / name).is_file()]
     if missing:
@@ -136,7 +185,7 @@ def _find_files(path: Path, contents: _Contents) -> tuple[tuple[Path, ...], str]
         inside = sorted(entry.parent.name for entry in path.glob('*/*.mcap'))
         hint = f'; name one of its recordings: {", ".join(inside[:5])}' if inside else ''
         raise UserError(f'{path}: no recording in this directory{hint}')
-    return tuple(files), 'mcap' if all(file.suffix == '.mcap' for file in files) else 'other'
+    return tuple(files)
 
 
 def _unlisted_files(folder: Path) -> list[Path]:
@@ -168,8 +217,8 @@ def _listed_files(folder: Path) -> list[str]:
         return []
 
 
-def _scan_other(file: Path, contents: _Contents) -> None:
-    """Read the bag directory of a file of another storage."""
+def _other(file: Path, contents: _Contents) -> Iterator[tuple[str, Definition, int, bytes]]:
+    """Messages of the bag directory of a file of another storage."""
     folder = file.parent
     if not (folder / 'metadata.yaml').is_file():
         raise UserError(
@@ -187,8 +236,12 @@ def _scan_other(file: Path, contents: _Contents) -> None:
                 )
                 for connection in reader.connections
             }
+            for connection in reader.connections:
+                if profiles := connection.ext.offered_qos_profiles:
+                    latched = any(q.durability.name == 'TRANSIENT_LOCAL' for q in profiles)
+                    contents.latched[connection.topic] = latched
             for connection, log_time, data in reader.messages():
                 definition = definitions[connection.topic, connection.id]
-                contents.add(connection.topic, definition, log_time, bytes(data))
+                yield connection.topic, definition, log_time, bytes(data)
     except (ReaderError, FileNotFoundError, sqlite3.Error) as error:
         raise UserError(f'{folder}: cannot be read as a recording: {error}') from error

@@ -35,13 +35,15 @@ class McapScan:
     """One pass over the messages of a file.
 
     Attributes, complete after `messages` was read to its end: `closed`, whether the file has the
-    index written at its closing; `warnings`, what is missing, one sentence each.
+    index written at its closing; `warnings`, what is missing, one sentence each; `offered`, topic
+    to the publishers' profiles as rosbag2 writes them (YAML).
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self.closed = False
         self.warnings: list[str] = []
+        self.offered: dict[str, str] = {}
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, tuple[str, Definition]] = {}
         self._whole = False
@@ -119,6 +121,7 @@ class McapScan:
         elif isinstance(record, Channel):
             if record.id not in self._channels:
                 self._channels[record.id] = (record.topic, self._definition(record))
+                self.offered[record.topic] = record.metadata.get('offered_qos_profiles', '')
         elif isinstance(record, Schema):
             self._schemas.setdefault(record.id, record)
 

@@ -61,6 +61,14 @@ def message_reader(definition: Definition, where: str) -> Callable[[bytes], Any]
     return partial(_read, store, definition.type_name)
 
 
+def type_hash(definition: Definition) -> str:
+    """ROS 2 type hash (REP 2016) of a definition, ``RIHS01_...``; '' where it cannot be read."""
+    try:
+        return _typestore(definition).hash_rihs01(definition.type_name)
+    except (TypesysError, KeyError):
+        return ''
+
+
 @lru_cache(maxsize=100)
 def _typestore(definition: Definition) -> Any:
     """Type store that knows one definition; parsing a text takes longer than reading a bag."""
