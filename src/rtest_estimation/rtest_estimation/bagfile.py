@@ -13,13 +13,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import yaml
 from rosbags.interfaces import MessageDefinitionFormat
 from rosbags.rosbag2 import Reader, ReaderError
 
 from rtest_estimation.errors import UserError
 from rtest_estimation.mcap_scan import McapScan
 from rtest_estimation.message_reader import Definition, full_name, message_reader
+from rtest_estimation.yaml_text import read_yaml
 
 
 @dataclass(frozen=True)
@@ -100,6 +100,7 @@ def read_bag(path: str | Path, keep: Collection[str]) -> Bag:
                     contents.add(*message)
                 contents.closed &= scan.closed
                 contents.warnings += scan.warnings
+            _compare_counts(path, contents)
         else:
             _scan_other(files[0], contents)
         size = sum(file.stat().st_size for file in files)
@@ -132,6 +133,10 @@ def _find_files(path: Path, contents: _Contents) -> tuple[tuple[Path, ...], str]
     files = [path / name for name in listed if name not in missing]
     # metadata.yaml can be provisional, gone, or of a bag that was renamed.
     files = files or _unlisted_files(path)
+    for file in files:
+        # A link could lead to any file of this computer.
+        if not file.resolve().is_relative_to(path.resolve()):
+            raise UserError(f'{file}: leads out of the recording; name that file if it is meant')
     if not files:
         inside = sorted(entry.parent.name for entry in path.glob('*/*.mcap'))
         hint = f'; name one of its recordings: {", ".join(inside[:5])}' if inside else ''
@@ -159,13 +164,45 @@ def _unlisted_files(folder: Path) -> list[Path]:
 
 def _listed_files(folder: Path) -> list[str]:
     """File names in metadata.yaml; none where it is missing or unreadable."""
+    listed = _metadata(folder).get('relative_file_paths')
+    # Older versions wrote the directory too; and nobody's metadata leads out of the bag.
+    names = [Path(str(name)).name for name in listed] if isinstance(listed, list) else []
+    return [name for name in names if name not in ('', '..')]
+
+
+def _metadata(folder: Path) -> dict[str, Any]:
+    """What metadata.yaml says; nothing where it is missing or unreadable."""
     try:
-        content = yaml.safe_load((folder / 'metadata.yaml').read_text(encoding='utf-8'))
-        listed = content['rosbag2_bagfile_information']['relative_file_paths']
-        # Older versions wrote the directory too; and nobody's metadata leads out of the bag.
-        return [Path(name).name for name in listed]
-    except (FileNotFoundError, UnicodeDecodeError, yaml.YAMLError, KeyError, TypeError):
-        return []
+        content = read_yaml(folder / 'metadata.yaml', 'metadata.yaml')
+    except UserError:
+        return {}
+    found = content.get('rosbag2_bagfile_information') if isinstance(content, dict) else None
+    return found if isinstance(found, dict) else {}
+
+
+def _compare_counts(path: Path, contents: _Contents) -> None:
+    """Say which topics have fewer messages than the recorder wrote, as metadata.yaml has it."""
+    if path.is_dir() or path.name == 'metadata.yaml':
+        told = recorded_counts(path if path.is_dir() else path.parent)
+        for topic, count in told.items():
+            if (found := contents.counts[topic]) < count:
+                contents.warnings.append(
+                    f'{topic}: {count - found} of {count} messages are missing, which were '
+                    'recorded before the file was cut or damaged'
+                )
+
+
+def recorded_counts(folder: Path) -> dict[str, int]:
+    """Messages by topic as metadata.yaml says; nothing where it does not."""
+    listed = _metadata(folder).get('topics_with_message_count')
+    counts = {}
+    for entry in listed if isinstance(listed, list) else ():
+        topic = entry.get('topic_metadata') if isinstance(entry, dict) else None
+        name = topic.get('name') if isinstance(topic, dict) else None
+        count = entry.get('message_count') if isinstance(entry, dict) else None
+        if isinstance(name, str) and isinstance(count, int):
+            counts[name] = count
+    return counts
 
 
 def _scan_other(file: Path, contents: _Contents) -> None:
