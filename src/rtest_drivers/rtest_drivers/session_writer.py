@@ -21,7 +21,7 @@ from rtest_drivers.message_types import Definition
 # Everything received is on the disk after this time [s] and one write of the disk.
 FLUSH_INTERVAL = 0.5
 # What may wait for the disk [bytes]: a quarter of an hour of three gauges at 1 kHz.
-MEMORY = 256 * 1024 * 1024
+MEMORY = 256_000_000
 # A disk that takes longer than this for one write has stalled [s].
 STALL = 2.0
 NOT_WRITTEN = 'not written'
