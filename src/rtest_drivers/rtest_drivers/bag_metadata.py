@@ -10,7 +10,10 @@ from typing import Any
 
 import yaml
 
-FILE_NAME = 'metadata.yaml'
+from rtest_estimation.bagfile import FILE_NAME
+from rtest_estimation.errors import UserError
+from rtest_estimation.yaml_text import load_yaml
+
 KEY = 'rosbag2_bagfile_information'
 VERSION = 9
 ROS_DISTRO = 'jazzy'
@@ -56,7 +59,7 @@ def bag_metadata(
                     'name': topic.name,
                     'type': topic.type_name,
                     'serialization_format': 'cdr',
-                    'offered_qos_profiles': yaml.safe_load(topic.qos) or [],
+                    'offered_qos_profiles': _profiles(topic.qos),
                     'type_description_hash': topic.type_hash,
                 },
                 'message_count': topic.count,
@@ -77,6 +80,18 @@ def bag_metadata(
         'custom_data': None,
         'ros_distro': ROS_DISTRO,
     }
+
+
+def _profiles(text: str) -> list[dict[str, Any]]:
+    """Offered profiles in the words of version 9; none where they are in those of older ones."""
+    try:
+        profiles = load_yaml(text, 'offered_qos_profiles')
+    except UserError:
+        return []
+    if not isinstance(profiles, list):
+        return []
+    words = [isinstance(one, dict) and isinstance(one.get('history'), str) for one in profiles]
+    return profiles if all(words) else []
 
 
 def write_metadata(folder: Path, metadata: dict[str, Any]) -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import sqlite3
 from collections import Counter, defaultdict
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,8 @@ from rtest_estimation.errors import UserError
 from rtest_estimation.mcap_scan import McapScan
 from rtest_estimation.message_reader import Definition, full_name, message_reader
 from rtest_estimation.yaml_text import read_yaml
+
+FILE_NAME = 'metadata.yaml'
 
 
 @dataclass(frozen=True)
@@ -92,7 +94,7 @@ def read_bag(path: str | Path, keep: Collection[str]) -> Bag:
         raise UserError(f'{path}: neither a file nor a directory; expected a recording')
     contents = _Contents(keep)
     try:
-        files, storage = _find_files(path, contents)
+        files, storage = find_files(path, contents.warnings)
         if storage == 'mcap':
             for file in files:
                 scan = McapScan(file)
@@ -100,7 +102,7 @@ def read_bag(path: str | Path, keep: Collection[str]) -> Bag:
                     contents.add(*message)
                 contents.closed &= scan.closed
                 contents.warnings += scan.warnings
-            _compare_counts(path, contents)
+            contents.warnings += missing_counts(path, contents.counts)
         else:
             _scan_other(files[0], contents)
         size = sum(file.stat().st_size for file in files)
@@ -120,16 +122,21 @@ def read_bag(path: str | Path, keep: Collection[str]) -> Bag:
     )
 
 
-def _find_files(path: Path, contents: _Contents) -> tuple[tuple[Path, ...], str]:
-    """Files of a recording in order, and their storage: ``mcap`` or ``other``."""
-    if path.name == 'metadata.yaml':
+def find_files(path: Path, warnings: list[str]) -> tuple[tuple[Path, ...], str]:
+    """Files of a recording in order, and their storage: ``mcap`` or ``other``.
+
+    warnings : to which is added what metadata.yaml names and what is not there
+
+    Raises UserError where there is no recording, or where it is not in its folder.
+    """
+    if path.name == FILE_NAME:
         path = path.parent
     if path.is_file():
         return (path,), 'other' if path.suffix in ('.db3', '.zstd') else 'mcap'
     listed = _listed_files(path)
     missing = [name for name in listed if not (path / name).is_file()]
     if missing:
-        contents.warnings.append(f'{path}/metadata.yaml names {missing[0]}, which is not there')
+        warnings.append(f'{path}/metadata.yaml names {missing[0]}, which is not there')
     files = [path / name for name in listed if name not in missing]
     # metadata.yaml can be provisional, gone, or of a bag that was renamed.
     files = files or _unlisted_files(path)
@@ -173,27 +180,31 @@ def _listed_files(folder: Path) -> list[str]:
 def _metadata(folder: Path) -> dict[str, Any]:
     """What metadata.yaml says; nothing where it is missing or unreadable."""
     try:
-        content = read_yaml(folder / 'metadata.yaml', 'metadata.yaml')
+        content = read_yaml(folder / FILE_NAME, FILE_NAME)
     except UserError:
         return {}
     found = content.get('rosbag2_bagfile_information') if isinstance(content, dict) else None
     return found if isinstance(found, dict) else {}
 
 
-def _compare_counts(path: Path, contents: _Contents) -> None:
-    """Say which topics have fewer messages than the recorder wrote, as metadata.yaml has it."""
-    if path.is_dir() or path.name == 'metadata.yaml':
-        told = recorded_counts(path if path.is_dir() else path.parent)
-        for topic, count in told.items():
-            if (found := contents.counts[topic]) < count:
-                contents.warnings.append(
-                    f'{topic}: {count - found} of {count} messages are missing, which were '
-                    'recorded before the file was cut or damaged'
-                )
+def missing_counts(path: Path, counts: Mapping[str, int]) -> list[str]:
+    """Topics with fewer messages than metadata.yaml says were recorded, one sentence each.
+
+    path : as a user names a recording; of a single file nothing is known
+    counts : messages that were found, by topic
+    """
+    folder = path.parent if path.name == FILE_NAME else path
+    told = recorded_counts(folder) if folder.is_dir() else {}
+    return [
+        f'{topic}: {count - counts.get(topic, 0)} of {count} messages are missing, which were '
+        'recorded before the file was cut or damaged'
+        for topic, count in told.items()
+        if counts.get(topic, 0) < count
+    ]
 
 
 def recorded_counts(folder: Path) -> dict[str, int]:
-    """Messages by topic as metadata.yaml says; nothing where it does not."""
+    """Messages by topic as the metadata.yaml of a folder says; nothing where it does not."""
     listed = _metadata(folder).get('topics_with_message_count')
     counts = {}
     for entry in listed if isinstance(listed, list) else ():

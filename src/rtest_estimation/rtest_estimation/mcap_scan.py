@@ -20,7 +20,7 @@ import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import EndOfFile, McapError
 from mcap.opcode import Opcode
-from mcap.records import Channel, Chunk, Footer, Metadata, Schema
+from mcap.records import Attachment, Channel, Chunk, Footer, Metadata, Schema
 from mcap.writer import MCAP0_MAGIC
 
 from rtest_estimation.errors import UserError
@@ -28,6 +28,8 @@ from rtest_estimation.message_reader import Definition, full_name
 
 # Name of the metadata records in which a recorder counts what it could not record.
 LOSSES = 'rtest_losses'
+# Name of the one in a mended file that says what could not be mended.
+MENDED = 'rtest_mended'
 # Opcode and length, with which every record begins, and what a message record goes on with:
 # channel, sequence, log time, publish time (MCAP specification, "Records").
 FRAME = struct.Struct('<BQ')
@@ -67,8 +69,8 @@ class McapScan:
 
     Attributes, complete after `entries` was read to its end: `closed`, whether the file has the
     index written at its closing; `warnings`, what is missing, one sentence each; `losses`, what
-    the recorder itself says is missing, with its number; `intact`, whether the file is as its
-    writer closed it.
+    the recorder itself says is missing, with its number; `metadata`, the metadata records;
+    `intact`, whether the file is as its writer closed it.
     """
 
     def __init__(self, path: Path) -> None:
@@ -76,6 +78,8 @@ class McapScan:
         self.closed = False
         self.warnings: list[str] = []
         self.losses: dict[str, int] = {}
+        self.metadata: list[Metadata] = []
+        self._attachments: list[tuple[int, int]] = []
         self._schemas: dict[int, Schema] = {}
         self._sources: dict[int, Source] = {}
         self._whole = False
@@ -113,6 +117,16 @@ class McapScan:
                 yield from self._take(opcode, content)
         self._conclude()
 
+    def attachments(self) -> Iterator[Attachment | None]:
+        """Attachments of the file, after `entries` was read; None for a damaged one."""
+        with self.path.open('rb') as file:
+            for place, length in self._attachments:
+                file.seek(place)
+                try:
+                    yield Attachment.read(_stream(file.read(min(length, MAX_CHUNK))))
+                except _DAMAGE:
+                    yield None
+
     def _records(self, file: BinaryIO) -> Iterator[tuple[int, bytes]]:
         """Opcode and content of the records up to the footer that are of use here."""
         while True:
@@ -125,6 +139,8 @@ class McapScan:
             if opcode == 0 or place + FRAME.size + length > self._size:
                 break
             if opcode not in _USED:
+                if opcode == Opcode.ATTACHMENT:
+                    self._attachments.append((file.tell(), length))
                 file.seek(length, 1)
             elif length > MAX_CHUNK:
                 self._damaged.append(f'record of {length} bytes')
@@ -231,12 +247,18 @@ class McapScan:
         return data
 
     def _note(self, metadata: Metadata) -> None:
+        self.metadata.append(metadata)
         if metadata.name == LOSSES:
             self.losses = {
                 _printable(what): int(count)
                 for what, count in list(metadata.metadata.items())[:_MAX_LOSSES]
                 if count.isascii() and count.isdecimal() and len(count) < 20
             }
+        elif metadata.name == MENDED:
+            self.warnings += [
+                f'{self.path.name} was mended: {_printable(text)}'
+                for text in list(metadata.metadata.values())[:_MAX_LOSSES]
+            ]
 
     def _conclude(self) -> None:
         name = self.path.name
