@@ -8,18 +8,20 @@ from __future__ import annotations
 
 import sqlite3
 from collections import Counter, defaultdict
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import yaml
 from rosbags.interfaces import MessageDefinitionFormat
 from rosbags.rosbag2 import Reader, ReaderError
 
 from rtest_estimation.errors import UserError
 from rtest_estimation.mcap_scan import McapScan
 from rtest_estimation.message_reader import Definition, full_name, message_reader
+from rtest_estimation.yaml_text import load_yaml, read_yaml
+
+FILE_NAME = 'metadata.yaml'
 
 
 @dataclass(frozen=True)
@@ -48,13 +50,14 @@ class Bag:
     latched: dict[str, bool] = field(default_factory=dict)
     ordered: bool = True
     definitions: dict[str, Definition] = field(default_factory=dict)
+    storage: str = 'mcap'
 
     def stream(self, topics: Collection[str]) -> Iterator[tuple[str, Definition, int, bytes]]:
         """Topic, definition, log time [ns] and data of every message, in the order of log time.
 
         Reads the files again, and so needs little memory; all of it where they are not in order.
         """
-        found = (m for m in _stored(self.files, _Contents(())) if m[0] in topics)
+        found = (m for m in _stored(self.files, self.storage, _Contents(())) if m[0] in topics)
         return found if self.ordered else iter(sorted(found, key=lambda message: message[2]))
 
     def messages(self, topic: str) -> Iterator[Any]:
@@ -112,9 +115,11 @@ def read_bag(path: str | Path, keep: Collection[str]) -> Bag:
         raise UserError(f'{path}: neither a file nor a directory; expected a recording')
     contents = _Contents(keep)
     try:
-        files = _find_files(path, contents)
-        for message in _stored(files, contents):
+        files, storage = find_files(path, contents.warnings)
+        for message in _stored(files, storage, contents):
             contents.add(*message)
+        if storage == 'mcap':
+            contents.warnings += missing_counts(path, contents.counts)
         size = sum(file.stat().st_size for file in files)
     except OSError as error:
         where = error.filename or path
@@ -135,17 +140,18 @@ def read_bag(path: str | Path, keep: Collection[str]) -> Bag:
         contents.latched,
         contents.ordered,
         contents.definitions,
+        storage,
     )
 
 
 def _stored(
-    files: tuple[Path, ...], contents: _Contents
+    files: tuple[Path, ...], storage: str, contents: _Contents
 ) -> Iterator[tuple[str, Definition, int, bytes]]:
     """Messages of the files in the order in which they are stored.
 
     contents : takes what else the files say
     """
-    if any(file.suffix in ('.db3', '.zstd') for file in files):
+    if storage != 'mcap':
         yield from _other(files[0], contents)
         return
     for file in files:
@@ -162,30 +168,39 @@ def _latched(profiles: str) -> bool | None:
     """Whether any of the publishers' profiles (YAML) is latched; None where there is none."""
     try:
         # Older versions of rosbag2 wrote numbers.
-        found = [profile['durability'] for profile in yaml.safe_load(profiles)]
-    except (yaml.YAMLError, KeyError, TypeError):
+        found = [profile['durability'] for profile in load_yaml(profiles, 'offered profiles')]
+    except (UserError, KeyError, TypeError):
         return None
     return any(durability in ('transient_local', 1) for durability in found)
 
 
-def _find_files(path: Path, contents: _Contents) -> tuple[Path, ...]:
-    """Files of a recording in order."""
-    if path.name == 'metadata.yaml':
+def find_files(path: Path, warnings: list[str]) -> tuple[tuple[Path, ...], str]:
+    """Files of a recording in order, and their storage: ``mcap`` or ``other``.
+
+    warnings : to which is added what metadata.yaml names and what is not there
+
+    Raises UserError where there is no recording, or where it is not in its folder.
+    """
+    if path.name == FILE_NAME:
         path = path.parent
     if path.is_file():
-        return (path,)
+        return (path,), 'other' if path.suffix in ('.db3', '.zstd') else 'mcap'
     listed = _listed_files(path)
     missing = [name for name in listed if not (path / name).is_file()]
     if missing:
-        contents.warnings.append(f'{path}/metadata.yaml names {missing[0]}, which is not there')
+        warnings.append(f'{path}/metadata.yaml names {missing[0]}, which is not there')
     files = [path / name for name in listed if name not in missing]
     # metadata.yaml can be provisional, gone, or of a bag that was renamed.
     files = files or _unlisted_files(path)
+    for file in files:
+        # A link could lead to any file of this computer.
+        if not file.resolve().is_relative_to(path.resolve()):
+            raise UserError(f'{file}: leads out of the recording; name that file if it is meant')
     if not files:
         inside = sorted(entry.parent.name for entry in path.glob('*/*.mcap'))
         hint = f'; name one of its recordings: {", ".join(inside[:5])}' if inside else ''
         raise UserError(f'{path}: no recording in this directory{hint}')
-    return tuple(files)
+    return tuple(files), 'mcap' if all(file.suffix == '.mcap' for file in files) else 'other'
 
 
 def _unlisted_files(folder: Path) -> list[Path]:
@@ -208,13 +223,49 @@ def _unlisted_files(folder: Path) -> list[Path]:
 
 def _listed_files(folder: Path) -> list[str]:
     """File names in metadata.yaml; none where it is missing or unreadable."""
+    listed = _metadata(folder).get('relative_file_paths')
+    # Older versions wrote the directory too; and nobody's metadata leads out of the bag.
+    names = [Path(str(name)).name for name in listed] if isinstance(listed, list) else []
+    return [name for name in names if name not in ('', '..')]
+
+
+def _metadata(folder: Path) -> dict[str, Any]:
+    """What metadata.yaml says; nothing where it is missing or unreadable."""
     try:
-        content = yaml.safe_load((folder / 'metadata.yaml').read_text(encoding='utf-8'))
-        listed = content['rosbag2_bagfile_information']['relative_file_paths']
-        # Older versions wrote the directory too; and nobody's metadata leads out of the bag.
-        return [Path(name).name for name in listed]
-    except (FileNotFoundError, UnicodeDecodeError, yaml.YAMLError, KeyError, TypeError):
-        return []
+        content = read_yaml(folder / FILE_NAME, FILE_NAME)
+    except UserError:
+        return {}
+    found = content.get('rosbag2_bagfile_information') if isinstance(content, dict) else None
+    return found if isinstance(found, dict) else {}
+
+
+def missing_counts(path: Path, counts: Mapping[str, int]) -> list[str]:
+    """Topics with fewer messages than metadata.yaml says were recorded, one sentence each.
+
+    path : as a user names a recording; of a single file nothing is known
+    counts : messages that were found, by topic
+    """
+    folder = path.parent if path.name == FILE_NAME else path
+    told = recorded_counts(folder) if folder.is_dir() else {}
+    return [
+        f'{topic}: {count - counts.get(topic, 0)} of {count} messages are missing, which were '
+        'recorded before the file was cut or damaged'
+        for topic, count in told.items()
+        if counts.get(topic, 0) < count
+    ]
+
+
+def recorded_counts(folder: Path) -> dict[str, int]:
+    """Messages by topic as the metadata.yaml of a folder says; nothing where it does not."""
+    listed = _metadata(folder).get('topics_with_message_count')
+    counts = {}
+    for entry in listed if isinstance(listed, list) else ():
+        topic = entry.get('topic_metadata') if isinstance(entry, dict) else None
+        name = topic.get('name') if isinstance(topic, dict) else None
+        count = entry.get('message_count') if isinstance(entry, dict) else None
+        if isinstance(name, str) and isinstance(count, int):
+            counts[name] = count
+    return counts
 
 
 def _other(file: Path, contents: _Contents) -> Iterator[tuple[str, Definition, int, bytes]]:
