@@ -8,8 +8,8 @@ three gauges at 1 kHz in messages of ten readings, encoder feedback at 100 Hz; a
 processor time, which other programs on the computer change less than the time that passes.
 
 The plain script is what one would write for this session alone: rosbags, numpy, and
-`scipy.linalg.lstsq` with a Jacobian from finite differences. It knows when the machine stood, takes
-plain means, and gives values without uncertainty.
+`scipy.linalg.lstsq` with a Jacobian from finite differences. It knows when the machine stood,
+takes plain means, and gives values without uncertainty.
 """
 
 from __future__ import annotations

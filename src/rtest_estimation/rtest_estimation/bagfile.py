@@ -31,7 +31,8 @@ class Bag:
     topics : name to (type, number of messages)
     size : of the files [bytes]; start, end : first and last log time [ns], 0 in an empty bag
     closed : whether every file has the index that is written when a recording is closed
-    raw : topic to its messages in file order, each with the definition to read it by
+    raw : topic to its messages in file order, of the types that are kept, each with the definition
+        to read it by
     latched : topic to whether a subscriber that came late got its last messages too; only of
         topics of which the file says it
     ordered : whether the log times never go back
@@ -52,12 +53,16 @@ class Bag:
     definitions: dict[str, Definition] = field(default_factory=dict)
     storage: str = 'mcap'
 
-    def stream(self, topics: Collection[str]) -> Iterator[tuple[str, Definition, int, bytes]]:
-        """Topic, definition, log time [ns] and data of every message, in the order of log time.
+    def stored(self, topics: Collection[str]) -> Iterator[tuple[str, Definition, int, bytes]]:
+        """Topic, definition, log time [ns] and data of every message, in file order.
 
-        Reads the files again, and so needs little memory; all of it where they are not in order.
+        Reads the files again, and so needs little memory.
         """
-        found = (m for m in _stored(self.files, self.storage, _Contents(())) if m[0] in topics)
+        return _stored(self.files, self.storage, _Contents(()), topics)
+
+    def stream(self, topics: Collection[str]) -> Iterator[tuple[str, Definition, int, bytes]]:
+        """The same in the order of log time; in memory where they are stored in another."""
+        found = self.stored(topics)
         return found if self.ordered else iter(sorted(found, key=lambda message: message[2]))
 
     def messages(self, topic: str) -> Iterator[Any]:
@@ -66,7 +71,10 @@ class Bag:
         Raises UserError where the file does not say what the type looks like.
         """
         readers: dict[Definition, Callable[[bytes], Any]] = {}
-        for definition, data in self.raw.get(topic, ()):
+        found = self.raw.get(topic)
+        if found is None:
+            found = ((definition, data) for _, definition, _, data in self.stored((topic,)))
+        for definition, data in found:
             if definition not in readers:
                 readers[definition] = message_reader(definition, f'{self.path}: topic {topic}')
             yield readers[definition](data)
@@ -145,18 +153,22 @@ def read_bag(path: str | Path, keep: Collection[str]) -> Bag:
 
 
 def _stored(
-    files: tuple[Path, ...], storage: str, contents: _Contents
+    files: tuple[Path, ...],
+    storage: str,
+    contents: _Contents,
+    topics: Collection[str] | None = None,
 ) -> Iterator[tuple[str, Definition, int, bytes]]:
     """Messages of the files in the order in which they are stored.
 
-    contents : takes what else the files say
+    contents : takes what else the files say; topics : those that are wanted, None for all
     """
     if storage != 'mcap':
-        yield from _other(files[0], contents)
+        found = _other(files[0], contents)
+        yield from (m for m in found if topics is None or m[0] in topics)
         return
     for file in files:
         scan = McapScan(file)
-        yield from scan.messages()
+        yield from scan.messages(topics)
         contents.closed &= scan.closed
         contents.warnings += scan.warnings
         for topic, profiles in scan.offered.items():

@@ -9,11 +9,12 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Container, Iterator
 from dataclasses import dataclass
+from functools import partial
 from io import BytesIO
 from pathlib import Path
-from typing import BinaryIO, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
 import lz4.frame
 import zstandard
@@ -34,6 +35,8 @@ MENDED = 'rtest_mended'
 # channel, sequence, log time, publish time (MCAP specification, "Records").
 FRAME = struct.Struct('<BQ')
 _MESSAGE = struct.Struct('<HIQQ')
+# Both at once.
+_WHOLE = struct.Struct('<BQHIQQ')
 # A chunk or record of more than this is damaged; writers make chunks of a few MB.
 MAX_CHUNK = 256 * 1024 * 1024
 # Measurements are packed to between a half and a twentieth of their size.
@@ -101,19 +104,26 @@ class McapScan:
             for source in self._sources.values()
         }
 
-    def messages(self) -> Iterator[tuple[str, Definition, int, bytes]]:
+    def messages(
+        self, topics: Container[str] | None = None
+    ) -> Iterator[tuple[str, Definition, int, bytes]]:
         """Topic, definition, log time [ns] and data (CDR) of every message, in file order.
+
+        topics : those whose messages are wanted; None for all
 
         Raises UserError as `entries` does.
         """
-        for source, _, log_time, _, data in self.entries():
-            yield source.topic, source.definition, log_time, data
+        yield from self._walk(partial(self._quick, topics, {}))
 
     def entries(self) -> Iterator[Entry]:
         """Every message in file order.
 
         Raises UserError where the file is no MCAP file or unpacks to more than a recording can.
         """
+        yield from self._walk(self._inside)
+
+    def _walk(self, inside: Callable[[bytes], Iterator[Any]]) -> Iterator[Any]:
+        """What `inside` makes of the records of each chunk."""
         with self.path.open('rb') as file:
             if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
                 raise UserError(
@@ -122,7 +132,7 @@ class McapScan:
                 )
             self._size = self.path.stat().st_size
             for opcode, content in self._records(file):
-                yield from self._take(opcode, content)
+                yield from self._take(opcode, content, inside)
         self._conclude()
 
     def attachments(self) -> Iterator[Attachment | None]:
@@ -165,7 +175,9 @@ class McapScan:
                 'is used, nothing after'
             )
 
-    def _take(self, opcode: int, content: bytes) -> Iterator[Entry]:
+    def _take(
+        self, opcode: int, content: bytes, inside: Callable[[bytes], Iterator[Any]]
+    ) -> Iterator[Any]:
         """Messages of one record of the file."""
         try:
             if opcode == Opcode.CHUNK:
@@ -178,25 +190,61 @@ class McapScan:
             self._damaged.append(' '.join(str(error).split()) or type(error).__name__)
             return
         if opcode == Opcode.CHUNK:
-            yield from self._inside(content)
-        elif (entry := self._record(opcode, content, 0, len(content))) is not None:
-            yield entry
+            yield from inside(content)
+        else:
+            yield from inside(FRAME.pack(opcode, len(content)) + content)
+
+    def _quick(
+        self,
+        topics: Container[str] | None,
+        known: dict[int, tuple[str, Definition] | None],
+        data: bytes,
+    ) -> Iterator[tuple[str, Definition, int, bytes]]:
+        """As `_inside` in a third of the time, for readers of long recordings.
+
+        known : topic and definition by channel, None of one that is not wanted; filled here
+        """
+        place, size = 0, len(data)
+        while place < size:
+            if place + _WHOLE.size <= size:
+                opcode, length, channel, _, log_time, _ = _WHOLE.unpack_from(data, place)
+                end = place + FRAME.size + length
+                if opcode == Opcode.MESSAGE and length >= _MESSAGE.size and end <= size:
+                    if channel in known:
+                        if (found := known[channel]) is not None:
+                            yield (*found, log_time, data[place + _WHOLE.size : end])
+                        place = end
+                        continue
+                    if (source := self._sources.get(channel)) is not None:
+                        wanted = topics is None or source.topic in topics
+                        known[channel] = (source.topic, source.definition) if wanted else None
+                        continue
+            if (frame := self._frame(data, place)) is None:
+                return
+            opcode, start, place = frame
+            self._record(opcode, data, start, place)
 
     def _inside(self, data: bytes) -> Iterator[Entry]:
         """Messages of an unpacked chunk, up to where it is damaged."""
-        place, size = 0, len(data)
-        while place < size:
-            if place + FRAME.size > size:
-                self._damaged.append('half a record at the end of a chunk')
+        place = 0
+        while place < len(data):
+            if (frame := self._frame(data, place)) is None:
                 return
-            opcode, length = FRAME.unpack_from(data, place)
-            start = place + FRAME.size
-            place = start + length
-            if place > size:
-                self._damaged.append('a record that is longer than its chunk')
-                return
+            opcode, start, place = frame
             if (entry := self._record(opcode, data, start, place)) is not None:
                 yield entry
+
+    def _frame(self, data: bytes, place: int) -> tuple[int, int, int] | None:
+        """Opcode, start and end of the record at a place; None where it is damaged."""
+        if place + FRAME.size > len(data):
+            self._damaged.append('half a record at the end of a chunk')
+            return None
+        opcode, length = FRAME.unpack_from(data, place)
+        start = place + FRAME.size
+        if start + length > len(data):
+            self._damaged.append('a record that is longer than its chunk')
+            return None
+        return opcode, start, start + length
 
     def _record(self, opcode: int, data: bytes, start: int, end: int) -> Entry | None:
         """The message in a part of the file; topics are remembered, others passed over."""

@@ -81,8 +81,13 @@ def type_hash(definition: Definition) -> str:
     """ROS 2 type hash (REP 2016) of a definition, ``RIHS01_...``; '' where it cannot be read."""
     try:
         return _typestore(definition).hash_rihs01(definition.type_name)
-    except (TypesysError, KeyError):
+    except (TypesysError, KeyError, ValueError, RecursionError):
         return ''
+
+
+def field_definitions(definition: Definition) -> Mapping[str, Any]:
+    """Fields of a type, for which there is a `message_reader`, and of its parts (rosbags)."""
+    return _typestore(definition).fielddefs
 
 
 @lru_cache(maxsize=100)
