@@ -28,6 +28,7 @@ setup(
             'gauges = rtest_drivers.nodes.gauges:main',
             'cnc = rtest_drivers.nodes.cnc:main',
             'recorder = rtest_drivers.nodes.recorder:main',
+            'replay = rtest_drivers.nodes.replay:main',
             'session = rtest_drivers.nodes.session:main',
             'cell = rtest_drivers.nodes.cell:main',
         ],

@@ -18,6 +18,7 @@ from rtest_drivers.commands import (
     identify,
     info,
     plan,
+    replay,
     session,
     thermal,
 )
@@ -25,7 +26,9 @@ from rtest_drivers.graph import ONE_THREAD
 from rtest_drivers.runner import NodeFailed, Stopped
 from rtest_estimation.errors import UserError
 
-COMMANDS = (session, ask, demo, plan, identify, gap, thermal, frustum, correct, info)
+COMMANDS = (
+    session, ask, demo, plan, identify, gap, thermal, frustum, correct, replay, info,
+)
 EXIT_FAILED, EXIT_USER, EXIT_INTERRUPTED, EXIT_PIPE = 1, 2, 130, 141
 
 

@@ -7,6 +7,7 @@ import re
 import tempfile
 import time
 import uuid
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -90,9 +91,7 @@ class GraphSettings:
             raise UserError(
                 f'namespace {self.namespace!r}: expected a ROS name such as cell_1 or /hall/cell_1'
             )
-        for rule in self.remaps:
-            if not _REMAP.fullmatch(rule):
-                raise UserError(f'remap {rule!r}: expected FROM:=TO')
+        check_remaps(self.remaps)
         if not 0.0 < self.rate < float('inf'):
             raise UserError(
                 f'rate {self.rate:g}: expected a number above 0; at {RATE:g} two processor cores '
@@ -113,6 +112,13 @@ class GraphSettings:
     def recording(self) -> Path:
         """The recording, one MCAP file."""
         return self.folder / f'{self.session}.mcap'
+
+
+def check_remaps(rules: Iterable[str]) -> None:
+    """Refuse what is no rule ``from:=to`` (UserError)."""
+    for rule in rules:
+        if not _REMAP.fullmatch(rule):
+            raise UserError(f'remap {rule!r}: expected FROM:=TO')
 
 
 def session_name(stem: str) -> str:

@@ -14,6 +14,7 @@ import numpy as np
 from rtest_estimation import nest as nests
 from rtest_estimation.average import Average, NoAverageError, average
 from rtest_estimation.buffers import FeedbackBuffer, GaugeBuffer
+from rtest_estimation.columns import FeedbackColumns
 from rtest_estimation.cycle_end import CycleEnd
 from rtest_estimation.cycle_start import CycleStart
 from rtest_estimation.dwell import ROTARY_LETTERS, Dwell, DwellRules, find_dwells
@@ -97,10 +98,15 @@ class Estimator:
 
     def add_feedback(self, sample: Feedback) -> None:
         """Encoder positions; a sample not newer than the one before is dropped (frozen source)."""
-        if not self._feedback.append(sample):
-            self.discarded += 1
-        elif sample.stamp - self._feedback.first > 2 * KEEP_BEFORE_NS and self._waits():
-            self._feedback.forget(sample.stamp - KEEP_BEFORE_NS)
+        stamps = np.array([sample.stamp], dtype=np.int64)
+        self.extend(FeedbackColumns(sample.axes, stamps, sample.position[None]))
+
+    def extend(self, samples: FeedbackColumns) -> None:
+        """Many samples at once; see `add_feedback`."""
+        self.discarded += self._feedback.extend(samples.axes, samples.stamps, samples.positions)
+        last = self._feedback.last
+        if last - self._feedback.first > 2 * KEEP_BEFORE_NS and self._waits():
+            self._feedback.forget(last - KEEP_BEFORE_NS)
 
     def add_gauges(self, block: GaugeBlock) -> None:
         """Gauge readings, one message's worth."""

@@ -46,6 +46,7 @@ class GaugeBlock:
     period : time between readings [s]; 0 when there is one reading
     displacement : (n, channels) float64 [m], positive along the gauge direction
     status : (n, channels) uint8, see `Status`
+    times : (n,) int64 [ns] of a block that is made of several messages; None for a single one
     """
 
     stamp: int
@@ -53,10 +54,13 @@ class GaugeBlock:
     period: float
     displacement: np.ndarray
     status: np.ndarray
+    times: np.ndarray | None = None
 
     @property
     def stamps(self) -> np.ndarray:
         """(n,) int64 acquisition time of every reading [ns]."""
+        if self.times is not None:
+            return self.times
         steps = np.arange(len(self.displacement)) * (self.period * 1e9)
         return self.stamp + np.rint(steps).astype(np.int64)
 

@@ -168,7 +168,7 @@ def _effects_of(
 def _in_order(
     estimator: Estimator, recording: Recording
 ) -> Iterator[tuple[int, Callable[..., None], object]]:
-    """Feedback and gauge blocks merged by acquisition time."""
-    feedback = ((r.stamp, estimator.add_feedback, r) for r in recording.feedback)
-    gauges = ((r.stamp, estimator.add_gauges, r) for r in recording.gauges)
+    """Feedback and readings, a second at a time, merged by acquisition time."""
+    feedback = ((int(p.stamps[0]), estimator.extend, p) for p in recording.feedback.pieces())
+    gauges = ((p.stamp, estimator.add_gauges, p) for p in recording.gauges.pieces())
     return heapq.merge(feedback, gauges, key=lambda item: item[0])

@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from rtest_estimation.dwell import DwellRules
 from rtest_estimation.errors import UserError
 from rtest_estimation.records import CyclePlan, Kind
+from rtest_estimation.yaml_text import read_yaml
 from rtest_identification.machine import Axis, Machine, load_machine
 from rtest_identification.moves import Approach, Speeds
 from rtest_identification.plan_check import Spindle, Table
@@ -101,12 +101,7 @@ def load_session(path: Path | str, kind: str | None = None) -> SessionConfig:
     Raises UserError naming file, key and what is expected.
     """
     path = Path(path)
-    try:
-        data = yaml.safe_load(path.read_text(encoding='utf-8'))
-    except (OSError, UnicodeDecodeError) as error:
-        raise UserError(f'{path}: cannot read the session file: {error}') from None
-    except yaml.YAMLError as error:
-        raise UserError(f'{path}: not valid YAML: {" ".join(str(error).split())}') from None
+    data = read_yaml(path, 'the session file')
     if not isinstance(data, dict):
         raise UserError(f'{path}: expected a mapping with machine, cycle and setups')
     reader = Reader(str(path), data)

@@ -22,12 +22,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from rtest_drivers.gauges import heidenhain, keyence, line_protocol, mitutoyo
 from rtest_drivers.gauges.frames import UNITS, Line, Protocol
 from rtest_estimation.errors import UserError
 from rtest_estimation.messages import MAX_CHANNELS
+from rtest_estimation.yaml_text import read_yaml
 from rtest_identification.session_reader import Reader
 
 # Name to what makes the protocol, and the keys of the device file that are its own.
@@ -90,13 +89,7 @@ class NestConfig:
 
 def load_nest(path: Path | str) -> NestConfig:
     """Read a device file; raises UserError naming file, key and what is expected."""
-    try:
-        # The loader makes nothing but plain values, as SafeLoader does.
-        data = yaml.load(Path(path).read_text(encoding='utf-8'), _Loader)
-    except (OSError, UnicodeDecodeError) as error:
-        raise UserError(f'{path}: cannot read the device file: {error}') from None
-    except yaml.YAMLError as error:
-        raise UserError(f'{path}: not valid YAML: {" ".join(str(error).split())}') from None
+    data = read_yaml(path, 'the device file')
     if not isinstance(data, dict):
         raise UserError(f'{path}: expected a mapping with the key controllers')
     reader = Reader(str(path), data)
@@ -200,15 +193,3 @@ def _choice(reader: Reader, key: str, known: Any) -> str:
     if not isinstance(value, str) or value not in known:
         raise UserError(f'{reader.where}: {key}: expected one of {sorted(known)}, got {value!r}')
     return value
-
-
-class _Loader(yaml.SafeLoader):
-    """Refuses a key that is there twice, of which YAML silently takes the last."""
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict:
-        mapping = super().construct_mapping(node, deep)
-        if len(mapping) != len(node.value):
-            raise yaml.constructor.ConstructorError(
-                None, None, 'a key is there twice', node.start_mark
-            )
-        return mapping

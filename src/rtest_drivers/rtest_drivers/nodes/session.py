@@ -135,7 +135,7 @@ class SessionNode(Node):
         self._problems: list[str] = []
         self._status = 'waiting for the other nodes'
         self._cycle_number = 0
-        self._wish = ''
+        self._wish, self._following = '', False
         # What each driver last said, and the state of the NC program: since when it has not run.
         self._said: dict[str, str] = {}
         self._heard = 0
@@ -285,7 +285,9 @@ class SessionNode(Node):
             if by_hand:
                 self._say_cycle(plan, f'start {self._program_name(plan)}')
             by_hand = True
+            self._following = True
             again = self._follow(plan, keys[-1])
+            self._following = False
             if not again:
                 return keys
 
@@ -530,10 +532,9 @@ class SessionNode(Node):
     def _on_wish(
         self, wish: str, _: Trigger.Request, response: Trigger.Response
     ) -> Trigger.Response:
-        # A simulated cycle needs nobody.
-        response.success = bool(self._open) and not self.simulated
-        response.message = self._status
-        if response.success:
+        response.success, response.message = self._following, self._status
+        # Otherwise it would be remembered, and meet a cycle that nobody meant.
+        if self._following:
             self._wish = wish
         else:
             response.message += '; there is nothing to repeat or skip'

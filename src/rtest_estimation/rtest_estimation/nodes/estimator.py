@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 from typing import Any
 
@@ -17,7 +18,7 @@ from rtest_estimation import messages, nest
 from rtest_estimation.dwell import DwellRules
 from rtest_estimation.nodes import diagnostics, publish
 from rtest_estimation.nodes.qos import LATCHED, LATCHED_100, STREAM
-from rtest_estimation.nodes.run import run
+from rtest_estimation.nodes.run import run, when_time_goes_back
 from rtest_estimation.pipeline import EstimationRules, Estimator, Finished
 from rtest_estimation.records import GaugeBlock, Status
 from rtest_estimation.sequence import SequenceCheck
@@ -32,14 +33,10 @@ class EstimatorNode(Node):
         settle = self.declare_parameter('settle_s', DwellRules().settle).value
         # The stream is for eyes and plots; finished cycles use every reading.
         self._centre_period = 1e9 / self.declare_parameter('sphere_centre_hz', 100.0).value
-        rules = EstimationRules(DwellRules(settle=float(settle)), float(radius) * 1e-3)
-        self._estimator = Estimator(rules)
-        self._centre_due = 0
-        self._damaged: list[str] = []
-        self._sequence = SequenceCheck()
-        # Readings that were lost before the current cycle.
-        self._lost_before = 0
+        self._rules = EstimationRules(DwellRules(settle=float(settle)), float(radius) * 1e-3)
         self._last: Finished | None = None
+        self._begin()
+        self._back = when_time_goes_back(self, self._begin)
 
         self._nest = self.create_publisher(NestCalibration, 'rtest/nest', LATCHED)
         self._centre = self.create_publisher(PointStamped, 'rtest/sphere_centre', STREAM)
@@ -49,16 +46,29 @@ class EstimatorNode(Node):
         self.create_subscription(GaugeSamples, 'rtest/gauges', self._on_gauges, STREAM)
         self.create_subscription(JointState, 'rtest/cnc/feedback', self._on_feedback, STREAM)
         self.create_service(Trigger, '~/finish', self._on_finish)
+        self.create_service(Trigger, '~/received', self._on_received)
         # On the wall clock: diagnostics keep coming when the simulated clock stands.
         self.create_timer(1.0, self._report, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
+    def _begin(self) -> None:
+        self._estimator = Estimator(self._rules)
+        self._received: Counter[str] = Counter()
+        self._centre_due = 0
+        self._damaged: list[str] = []
+        self._sequence = SequenceCheck()
+        # Readings that were lost before the current cycle.
+        self._lost_before = 0
+
     def _on_plan(self, message: CyclePlan) -> None:
+        self._received['plan'] += 1
         self._accept(messages.cycle_plan, message, self._estimator.add_plan)
 
     def _on_feedback(self, message: JointState) -> None:
+        self._received['feedback'] += 1
         self._accept(messages.feedback, message, self._estimator.add_feedback)
 
     def _on_gauges(self, message: GaugeSamples) -> None:
+        self._received['gauges'] += 1
         self._accept(messages.gauge_block, message, self._add_gauges)
 
     def _accept(
@@ -115,6 +125,12 @@ class EstimatorNode(Node):
             self._publish(ready)
         response.success = True
         response.message = f'{len(self._estimator.nests)} nest calibrations'
+        return response
+
+    def _on_received(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        """How many messages were taken, for whoever must not send faster than that."""
+        response.success = True
+        response.message = ' '.join(f'{name} {n}' for name, n in self._received.items())
         return response
 
     def _report(self) -> None:

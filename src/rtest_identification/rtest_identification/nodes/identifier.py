@@ -14,7 +14,7 @@ from rtest_estimation.attempts import counted
 from rtest_estimation.errors import UserError
 from rtest_estimation.nodes import diagnostics
 from rtest_estimation.nodes.qos import LATCHED, LATCHED_100
-from rtest_estimation.nodes.run import run
+from rtest_estimation.nodes.run import run, when_time_goes_back
 from rtest_estimation.records import Cycle as CycleRecord
 from rtest_estimation.records import Kind
 from rtest_identification.gap.model_file import load_model
@@ -31,8 +31,8 @@ class IdentifierNode(Node):
     def __init__(self) -> None:
         super().__init__('identifier')
         self._machine: Machine | None = None
-        self._cycles: list[CycleRecord] = []
-        self._result: Identification | None = None
+        self._begin()
+        self._back = when_time_goes_back(self, self._begin)
         self._problem = 'waiting for the machine'
         self._location = self.create_publisher(LocationErrors, 'rtest/location_errors', LATCHED)
         self._map = self.create_publisher(ErrorMap, 'rtest/error_map', LATCHED_100)
@@ -46,6 +46,10 @@ class IdentifierNode(Node):
         self.create_subscription(Cycle, 'rtest/cycle', self._on_cycle, LATCHED_100)
         self.create_service(Trigger, '~/finish', self._on_finish)
         self.create_timer(1.0, self._report, clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+    def _begin(self) -> None:
+        self._cycles: list[CycleRecord] = []
+        self._result: Identification | None = None
 
     def _on_machine(self, message: String) -> None:
         try:
@@ -64,8 +68,7 @@ class IdentifierNode(Node):
             self.get_logger().error(f'rtest/cycle: {error}')
             return
         if any(c.plan.session != cycle.plan.session for c in self._cycles):
-            self._cycles.clear()
-            self._result = None
+            self._begin()
         self._cycles = counted([*self._cycles, cycle])
         if cycle.plan.kind is Kind.STATIC:
             self._identify()
