@@ -72,7 +72,7 @@ class IdentifierNode(Node):
 
     def _on_nest(self, message: NestCalibration) -> None:
         nest = messages.nest_calibration(message)
-        self._directions[nest.calibration] = nest.direction
+        self._directions[nest.calibration] = nest.sensitive
 
     def _identify(self) -> None:
         if self._machine is None:
