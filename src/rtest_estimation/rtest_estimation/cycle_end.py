@@ -57,19 +57,24 @@ class CycleEnd:
             since, self._since = self._since, self._since if there else None
             if sample.stamp - since < stood or self._tried == since:
                 continue
+            if plan.kind is Kind.DYNAMIC and not there:
+                continue
             self._tried = since
             end = since + int(stood) if there else sample.stamp
-            if self._done(plan, *feedback.window(plan, begin, end)):
+            if self._done(plan, *feedback.window(plan, begin, end), np.array(near)):
                 self._end = end
                 return end
         return None
 
-    def _done(self, plan: CyclePlan, stamps: np.ndarray, positions: np.ndarray) -> bool:
+    def _done(
+        self, plan: CyclePlan, stamps: np.ndarray, positions: np.ndarray, near: np.ndarray
+    ) -> bool:
         """Whether the last pose was reached, and not as the first of all."""
+        if plan.kind is Kind.DYNAMIC:
+            return bool((np.abs(positions - plan.commands[-1]) > near).any())
         dwells, missing = find_dwells(plan, stamps, positions, self.rules)
         reached = {d.index for d in dwells}
-        done = len(plan.commands) - 1 in reached and plan.kind is not Kind.DYNAMIC
-        return done and (len(reached) > 1 or not missing)
+        return len(plan.commands) - 1 in reached and (len(reached) > 1 or not missing)
 
 
 def _there(axes: tuple[str, ...], sample: Feedback, last: np.ndarray, near: list[float]) -> bool:

@@ -54,13 +54,13 @@ class EstimationRules:
 class Finished:
     """A finished cycle; after a nest calibration also its result or why there is none.
 
-    means : row of the plan to the mean readings there, also where they give no sphere centre
+    means : poses with mean readings, also where these give no sphere centre
     """
 
     cycle: Cycle
     nest: NestCalibration | None = None
     problem: str = ''
-    means: dict[int, Average] = field(default_factory=dict)
+    means: tuple[tuple[Dwell, Average], ...] = ()
 
 
 class Estimator:
@@ -256,9 +256,14 @@ def _points(
     dwells: list[Dwell],
     missing: list[Missing],
     data: tuple[np.ndarray, np.ndarray, np.ndarray],
-) -> tuple[tuple[CyclePoint, ...], tuple[Missing, ...], dict[int, Average]]:
-    """Sphere centres of the dwells, relative to the first of them (initial reset, Eq. 3-2)."""
-    points, lost, means = [], list(missing), {}
+) -> tuple[
+    tuple[CyclePoint, ...], tuple[Missing, ...], tuple[tuple[Dwell, Average], ...]
+]:
+    """Sphere centres of the dwells, relative to the first of them (initial reset, Eq. 3-2).
+
+    Also the poses that have none, and the mean readings of those that have some.
+    """
+    points, lost, means = [], list(missing), []
     needed, locate = _locator(nest)
     for dwell in dwells:
         try:
@@ -267,7 +272,8 @@ def _points(
                     f'{data[1].shape[1]} gauges, the nest was calibrated with '
                     f'{len(nest.direction)}'
                 )
-            mean = means[dwell.index] = _mean(dwell, data, needed)
+            mean = _mean(dwell, data, needed)
+            means.append((dwell, mean))
             position, covariance, disagreement = locate(mean)
         except NoAverageError as error:
             lost.append(Missing(dwell.index, str(error)))
@@ -281,7 +287,7 @@ def _points(
     if points:
         reset = points[0].displacement
         points = [replace(p, displacement=p.displacement - reset) for p in points]
-    return tuple(points), tuple(sorted(lost, key=lambda m: m.index)), means
+    return tuple(points), tuple(sorted(lost, key=lambda m: m.index)), tuple(means)
 
 
 def _locator(

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rtest_estimation.errors import UserError
-from rtest_estimation.records import Cycle, Kind
+from rtest_estimation.records import Cycle, CyclePlan, Kind
 from rtest_identification.kinematics import predict
 from rtest_identification.machine import Machine
 
@@ -69,12 +69,21 @@ class Observations:
         return result.centre - self.sphere, result.jacobian
 
 
+def turns(machine: Machine, plan: CyclePlan) -> bool:
+    """Whether a cycle is a static one in which a rotary axis moves.
+
+    Otherwise it says nothing of them: it verifies the nest.
+    """
+    columns = [plan.axes.index(name) for name in machine.rotary if name in plan.axes]
+    return plan.kind is Kind.STATIC and bool(np.ptp(plan.commands[:, columns], axis=0).any())
+
+
 def stack(machine: Machine, cycles: Sequence[Cycle]) -> Observations:
-    """Stack the points of all static cycles.
+    """Stack the points of all static cycles in which a rotary axis moves.
 
     Raises UserError where a cycle's axes are not the machine's, or nothing was measured.
     """
-    static = [cycle for cycle in cycles if cycle.plan.kind is Kind.STATIC and cycle.points]
+    static = [cycle for cycle in cycles if turns(machine, cycle.plan) and cycle.points]
     if not static:
         raise UserError(
             'no static cycle with a valid point in this session; '

@@ -15,7 +15,7 @@ from rtest_identification.error_map import AxisMap
 from rtest_identification.grid_map import GridMap
 from rtest_identification.location import MAP_SIGNIFICANCE, Effects, Estimate, Fit, fit
 from rtest_identification.machine import Machine
-from rtest_identification.observations import Observations, repeatability, stack
+from rtest_identification.observations import Observations, repeatability, stack, turns
 from rtest_identification.symbols import ErrorParameter
 from rtest_identification.uncertainty import AxisPrior, Budget, Sources, budget
 
@@ -139,7 +139,7 @@ def identify(
     return Identification(
         session, machine, observations, result, noise, freedom, runout, shares, sources, outliers,
         missing, tuple(warnings), tuple(notes) + _about_priors(priors), _disagreement(cycles),
-        poses=sum(len(c.plan.commands) for c in cycles if c.plan.kind is Kind.STATIC),
+        poses=sum(len(c.plan.commands) for c in cycles if turns(machine, c.plan)),
     )
 
 

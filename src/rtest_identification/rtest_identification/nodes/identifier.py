@@ -22,6 +22,7 @@ from rtest_identification.gap.offline import gap_session
 from rtest_identification.gap.output import summary
 from rtest_identification.machine import Machine, parse_machine
 from rtest_identification.nodes import publish
+from rtest_identification.observations import turns
 from rtest_identification.pipeline import Identification, identify
 
 
@@ -51,8 +52,7 @@ class IdentifierNode(Node):
         try:
             self._machine = parse_machine(message.data, 'rtest/machine')
             self._problem = 'waiting for a static cycle'
-            if any(c.plan.kind is Kind.STATIC for c in self._cycles):
-                self._identify()
+            self._identify()
         except UserError as error:
             self._machine, self._problem = None, str(error)
             self.get_logger().error(str(error))
@@ -75,7 +75,7 @@ class IdentifierNode(Node):
         self._directions[nest.calibration] = nest.sensitive
 
     def _identify(self) -> None:
-        if self._machine is None:
+        if self._machine is None or not any(turns(self._machine, c.plan) for c in self._cycles):
             return
         try:
             result = identify(self._machine, tuple(self._cycles))
