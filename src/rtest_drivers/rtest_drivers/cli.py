@@ -16,6 +16,7 @@ from rtest_drivers.commands import (
     gap,
     identify,
     info,
+    laser,
     plan,
     session,
     thermal,
@@ -24,7 +25,7 @@ from rtest_drivers.graph import ONE_THREAD
 from rtest_drivers.runner import NodeFailed, Stopped
 from rtest_estimation.errors import UserError
 
-COMMANDS = (session, demo, plan, identify, gap, thermal, frustum, correct, info)
+COMMANDS = (session, demo, plan, identify, gap, thermal, frustum, correct, laser, info)
 EXIT_FAILED, EXIT_USER, EXIT_INTERRUPTED, EXIT_PIPE = 1, 2, 130, 141
 
 
