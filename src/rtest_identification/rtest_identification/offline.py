@@ -160,12 +160,13 @@ def identify_recording(
         tolerances.check(machine)
     recording = recording_of(bag, topics)
     finished = estimate_recording(recording, None, progress)
-    directions = {f.nest.setup: f.nest.sensitive for f in finished if f.nest is not None}
+    nests = [f.nest for f in finished if f.nest is not None]
+    directions = {nest.setup: nest.sensitive for nest in nests}
     effects = None
     if model:
         effects = _effects_of(model, more, recording.plans[0].stamp, directions)
     try:
-        result = identify(machine, [f.cycle for f in finished], priors, effects)
+        result = identify(machine, [f.cycle for f in finished], priors, effects, nests)
     except UserError as error:
         why = '; '.join(lost_cycles(finished))
         raise UserError(f'{path}: {error}' + (f' ({why})' if why else '')) from None

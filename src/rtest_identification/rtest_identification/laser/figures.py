@@ -17,7 +17,9 @@ from rtest_identification.laser.recorded import LaserResult, NestCheck, Scan
 _MM, _UM = 1e3, 1e6
 _AREAS = ('-', '--', ':')
 # Room for the longest error arrow in the verified cube, as a share of its edge.
-_ROOM = 0.12
+_ROOM = 0.2
+# The distances that are drawn [µm].
+_SHOWN = 0.1
 
 
 def scan_figure(scan: Scan, result: LaserResult) -> Figure:
@@ -36,10 +38,10 @@ def scan_figure(scan: Scan, result: LaserResult) -> Figure:
     if lost.any():
         area.plot(*place[lost].T, 'x', color='0.6', markersize=2, label='area 4: no signal')
     for radius, style, name in _areas(scan):
-        area.add_patch(Circle((0.0, 0.0), radius * _MM, fill=False, linestyle=style, label=name))
+        area.add_patch(Circle((0.0, 0.0), radius * _MM, fill=False, linestyle=style))
+        area.plot([], [], color='black', linestyle=style, label=name)
     area.set(title='Error over the sphere, best-fit sphere removed', aspect='equal',
              ylabel='across the lines, from the top [mm]')
-    area.legend(loc='upper center', bbox_to_anchor=(0.5, -0.14), fontsize=8, ncols=2)
     for axes, column, name in ((along, 0, 'along'), (across, 1, 'across')):
         _superimposed(axes, scan, place[:, column], limit)
         axes.set(title=f'Error {name} the lines, all lines superimposed',
@@ -47,6 +49,9 @@ def scan_figure(scan: Scan, result: LaserResult) -> Figure:
     for axes, name in ((raw, 'along'), (area, 'along'), (along, 'along'), (across, 'across')):
         axes.set_xlabel(f'{name} the lines, from the top [mm]')
         axes.grid(alpha=0.3)
+    (marks, names), more = area.get_legend_handles_labels(), along.get_legend_handles_labels()
+    figure.legend(marks + more[0], names + more[1], loc='outside lower center', ncols=3,
+                  fontsize=9, markerscale=4)
     figure.suptitle(
         f'{result.session}, {scan.cycle}: laser {scan.laser} on a sphere of '
         f'{result.sphere_radius * _MM:g} mm radius; noise level {profile.noise * _UM:.2f} µm (1σ)'
@@ -69,14 +74,13 @@ def _areas(scan: Scan) -> list[tuple[float, str, str]]:
 def _superimposed(axes: Axes, scan: Scan, place: np.ndarray, limit: float) -> None:
     profile, valid = scan.profile, scan.valid
     axes.plot(place[valid], profile.error[valid] * _UM, '.', markersize=1.5, color='0.7',
-              label='readings')
+              label='error of each reading')
     axes.plot(place[valid], profile.smooth[valid] * _UM, '.', markersize=1.5, color=COLOURS[1],
-              label='its smooth part: what inclination does')
+              label='its smooth part: inclination')
     for radius, style, _ in _areas(scan):
         for sign in (-1, 1):
             axes.axvline(sign * radius * _MM, linestyle=style, color='black', linewidth=0.8)
     axes.set_ylim(-1.3 * limit, 1.3 * limit)
-    axes.legend(fontsize=8, markerscale=6)
 
 
 def verification_figure(check: NestCheck, result: LaserResult) -> Figure:
@@ -98,19 +102,20 @@ def verification_figure(check: NestCheck, result: LaserResult) -> Figure:
     if thesis is not None:
         spread.axvline(thesis.mean * _UM, color='black', linestyle=':', linewidth=1.0,
                        label=f"mean with the thesis's kernel: {thesis.mean * _UM:.2f} µm")
-    spread.set(xscale='log', xlabel='distance from the commanded position [µm]',
-               ylabel='share of the points [%]', ylim=(0, 100),
+    spread.set(xscale='log', xlim=(_SHOWN, None), ylim=(0, 100),
+               xlabel='distance from the position by the encoders [µm]',
+               ylabel='share of the points [%]',
                title=f'{int(valid.sum()):,} of {len(valid):,} points in the calibrated volume')
     spread.legend(fontsize=8, loc='upper center', bbox_to_anchor=(0.5, -0.16))
     spread.grid(alpha=0.3, which='both')
     middle = valid & (np.abs(check.positions[:, 2]) < 1e-5)
     place = check.positions[middle]
     room = _ROOM * float(np.ptp(check.positions, axis=0).max())
-    factor = magnification([verification.raw_error[middle]], room)
     for axes, error, colour, name in (
         (raw, verification.raw_error, COLOURS[1], 'Not corrected'),
         (corrected, verification.error, COLOURS[0], 'Corrected'),
     ):
+        factor = magnification([error[middle]], room)
         shift = factor * error[middle]
         axes.plot(*place[:, :2].T * _MM, '.', color='0.6', markersize=3)
         axes.quiver(*place[:, :2].T * _MM, *shift[:, :2].T * _MM, angles='xy',

@@ -21,9 +21,10 @@ from rtest_estimation.recording import Recording, read_recording
 from rtest_estimation.records import CyclePlan, Kind, NestCalibration, NestKind, Status
 from rtest_identification.offline import estimate_recording, rules_of
 
-# Readings of a scan count at these shares of its feed: between are the lines, not the ends of
-# them where the machine stands, nor the way to the first one.
+# Readings of a scan count at these shares of its feed, and at this cosine of their motion and the
+# lines: not at the ends of the lines and on the ways between them.
 _SPEEDS = (0.02, 1.5)
+_ALONG = 0.95
 
 
 @dataclass(frozen=True)
@@ -194,11 +195,11 @@ def _scan(
 ) -> Scan:
     """Readings along the lines, and the sphere in them; raises ValueError where there is none."""
     plan = finished.cycle.plan
-    times, displacement, status, positions = _on_the_way(recording, finished)
-    if not len(times):
-        raise ValueError('no readings while the axes moved along the lines')
     centre = plan.commands[:, _linear(plan)].mean(axis=0)
     along, across, normal = _plane(plan.commands[:, _linear(plan)])
+    times, displacement, status, positions = _on_lines(recording, finished, along)
+    if not len(times):
+        raise ValueError('no readings while the axes moved along the lines')
     laser = _laser_of(displacement.shape[1], normal, plan.setup, checks)
     place = (positions - centre) @ np.column_stack([along, across])
     reading, valid = displacement[:, laser], status[:, laser] == Status.VALID
@@ -208,10 +209,10 @@ def _scan(
     return Scan(plan.cycle, plan.setup, laser + 1, place, reading, valid, profile)
 
 
-def _on_the_way(
-    recording: Recording, finished: Finished
+def _on_lines(
+    recording: Recording, finished: Finished, along: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Stamps (n,), readings and status (n, lasers), positions (n, 3) while the axes moved."""
+    """Stamps (n,), readings and status (n, lasers), positions (n, 3) on the lines of a scan."""
     plan, end = finished.cycle.plan, finished.cycle.stamp
     gauges, feedback = GaugeBuffer(), FeedbackBuffer()
     for block in recording.gauges:
@@ -223,12 +224,13 @@ def _on_the_way(
     if len(stamps) < 2 or not len(times):
         return times[:0], displacement[:0], status[:0], np.empty((0, 3))
     rows = rows[:, _linear(plan)]
-    speed = np.linalg.norm(np.diff(rows, axis=0), axis=1) / (np.diff(stamps) * 1e-9)
+    velocity = np.diff(rows, axis=0) / (np.diff(stamps) * 1e-9)[:, np.newaxis]
+    speed = np.linalg.norm(velocity, axis=1)
     step = np.searchsorted(stamps, times, 'right') - 1
     inside = (step >= 0) & (step < len(speed))
     slow, fast = (share * plan.feed for share in _SPEEDS)
-    pace = speed[np.clip(step, 0, len(speed) - 1)]
-    kept = inside & (pace > slow) & (pace < fast)
+    good = (speed > slow) & (speed < fast) & (np.abs(velocity @ along) > _ALONG * speed)
+    kept = inside & good[np.clip(step, 0, len(speed) - 1)]
     since = (times[kept] - stamps[0]) * 1e-9
     known = (stamps - stamps[0]) * 1e-9
     positions = np.column_stack([np.interp(since, known, column) for column in rows.T])
