@@ -278,6 +278,13 @@ class Cell:
         positions += self._encoder_noise.standard_normal(positions.shape) * [
             *noise, data.rotary_noise
         ]
+        step = np.array([
+            data.rotary_step if name == SPINDLE or machine.axes[name].rotary else data.linear_step
+            for name in self.axes
+        ])
+        if step.any():
+            stepped = np.round(positions / np.where(step, step, 1.0)) * step
+            positions = np.where(step, stepped, positions)
         stale = self._active('feedback_stale', times)
         silent = self._active('feedback_silent', times)
         for index, time in enumerate(times):

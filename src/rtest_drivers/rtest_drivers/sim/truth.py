@@ -29,11 +29,13 @@ _UM, _MS, _DEG, _MM = 1e-6, 1e-3, math.pi / 180.0, 1e-3
 
 @dataclass(frozen=True)
 class Encoders:
-    """Encoder feedback: period [ns], white noise of linear [m] and rotary axes [rad]."""
+    """Encoder feedback: period [ns]; of linear [m] and rotary axes [rad] white noise and steps."""
 
     period: int
     linear_noise: float
     rotary_noise: float
+    linear_step: float = 0.0
+    rotary_step: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -138,6 +140,8 @@ def _encoders(fields: Fields) -> Encoders:
         _period(fields),
         fields.number('linear_noise_um', 0.0, 0.0, _UM),
         fields.number('rotary_noise_urad', 0.0, 0.0, 1e-6),
+        fields.number('linear_step_um', 0.0, 0.0, _UM),
+        fields.number('rotary_step_urad', 0.0, 0.0, 1e-6),
     )
     fields.done()
     return encoders
