@@ -36,7 +36,8 @@ def graph(context: LaunchContext) -> list[Node]:
     )
     session = load_session(config)
     settings = replace(
-        settings, sphere_radius=session.sphere_radius, devices=session.devices
+        settings, sphere_radius=session.sphere_radius, nest=session.nest.name.lower(),
+        devices=session.devices,
     )
     return [
         (LifecycleNode if node.lifecycle else Node)(

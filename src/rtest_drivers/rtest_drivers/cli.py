@@ -17,6 +17,7 @@ from rtest_drivers.commands import (
     gap,
     identify,
     info,
+    laser,
     plan,
     replay,
     session,
@@ -27,7 +28,7 @@ from rtest_drivers.runner import NodeFailed, Stopped
 from rtest_estimation.errors import UserError
 
 COMMANDS = (
-    session, ask, demo, plan, identify, gap, thermal, frustum, correct, replay, info,
+    session, ask, demo, plan, identify, gap, thermal, frustum, correct, laser, replay, info,
 )
 EXIT_FAILED, EXIT_USER, EXIT_INTERRUPTED, EXIT_PIPE = 1, 2, 130, 141
 

@@ -59,7 +59,7 @@ class GraphSettings:
 
     config : session file (YAML)
     session : name of the session, of its folder and of its recording
-    sphere_radius : of the session file [m]
+    sphere_radius : of the session file [m]; nest : 'contact' or 'laser', as there
     out : the recording is written to out/session/session.mcap
     simulate : truth file of the simulated cell; None for real devices
     devices : of the session file, for the drivers that are to be started; not used with `simulate`
@@ -75,6 +75,7 @@ class GraphSettings:
     simulate: Path | None = None
     devices: dict[str, Device] = field(default_factory=dict)
     sphere_radius: float = 0.0127
+    nest: str = 'contact'
     rate: float = 1.0
     namespace: str = ''
     remaps: tuple[str, ...] = ()
@@ -150,7 +151,9 @@ def session_nodes(settings: GraphSettings) -> tuple[GraphNode, ...]:
         GraphNode(
             'estimator',
             'rtest_estimation',
-            {'sphere_radius_mm': settings.sphere_radius * 1e3, **clock},
+            {
+                'sphere_radius_mm': settings.sphere_radius * 1e3, 'nest': settings.nest, **clock,
+            },
         ),
         GraphNode('identifier', 'rtest_identification', clock),
     ]

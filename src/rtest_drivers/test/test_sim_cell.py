@@ -300,7 +300,7 @@ def test_stamps_and_sequence_are_contiguous() -> None:
     [
         ({'axes': ('X', 'Y', 'Z', 'B', 'A')}, 'no axis A'),
         ({'commands': np.full((1, 5), 0.3)}, 'pose 0: X = 0.3 is outside'),
-        ({'kind': Kind.DYNAMIC}, 'does static cycles'),
+        ({'kind': Kind.DYNAMIC}, 'dynamic cycles of linear axes only'),
     ],
 )
 def test_impossible_plans_are_refused(changes: dict, expected: str) -> None:

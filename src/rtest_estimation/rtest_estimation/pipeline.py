@@ -7,10 +7,13 @@ what the node published.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
+from rtest_estimation import laser
 from rtest_estimation import nest as nests
 from rtest_estimation.average import Average, NoAverageError, average
 from rtest_estimation.buffers import FeedbackBuffer, GaugeBuffer
@@ -27,6 +30,7 @@ from rtest_estimation.records import (
     Kind,
     Missing,
     NestCalibration,
+    NestKind,
 )
 
 # Readings and feedback from before a plan arrives are kept this long: the plan travels on another
@@ -40,19 +44,24 @@ MAX_SCATTER = 20e-6
 
 @dataclass(frozen=True)
 class EstimationRules:
-    """Parameters of the estimation; sphere_radius [m] is passed on to the calibration."""
+    """Parameters of the estimation: of which kind the nest is, and its sphere_radius [m]."""
 
     dwell: DwellRules = field(default_factory=DwellRules)
     sphere_radius: float = float('nan')
+    nest: NestKind = NestKind.CONTACT
 
 
 @dataclass(frozen=True)
 class Finished:
-    """A finished cycle; after a nest calibration also its result or why there is none."""
+    """A finished cycle; after a nest calibration also its result or why there is none.
+
+    means : poses with mean readings, also where these give no sphere centre
+    """
 
     cycle: Cycle
     nest: NestCalibration | None = None
     problem: str = ''
+    means: tuple[tuple[Dwell, Average], ...] = ()
 
 
 class Estimator:
@@ -185,8 +194,8 @@ class Estimator:
             problem = f'no nest calibration of set-up {plan.setup}'
             everything = tuple(Missing(row, problem) for row in range(len(plan.commands)))
             return Finished(Cycle(plan, (), everything, '', end), problem=problem)
-        points, missing = _points(plan, nest, dwells, missing, data)
-        return Finished(Cycle(plan, points, missing, nest.calibration, end))
+        points, missing, means = _points(plan, nest, dwells, missing, data)
+        return Finished(Cycle(plan, points, missing, nest.calibration, end), means=means)
 
     def _calibrate(
         self,
@@ -196,7 +205,7 @@ class Estimator:
         data: tuple[np.ndarray, np.ndarray, np.ndarray],
         end: int,
     ) -> Finished:
-        """Eq. 2-5 on the dwells whose gauges were all valid."""
+        """Eq. 2-5, of lasers Eq. 5-3, on the dwells whose gauges were all valid."""
         positions, readings, lost = [], [], list(missing)
         linear = [c for c, axis in enumerate(plan.axes) if axis not in ROTARY_LETTERS]
         if [plan.axes[c] for c in linear] != ['X', 'Y', 'Z']:
@@ -215,8 +224,9 @@ class Estimator:
             problem = f'no pose of {plan.cycle} has valid readings'
             return Finished(Cycle(plan, (), tuple(lost), '', end), problem=problem)
         steps = np.array(positions) - plan.commands[0, linear]
+        calibrate = laser.calibrate if self.rules.nest is NestKind.LASER else nests.calibrate
         try:
-            nest = nests.calibrate(
+            nest = calibrate(
                 steps, np.array(readings), f'{plan.session}/{plan.cycle}', plan.setup, end,
                 self.rules.sphere_radius,
             )
@@ -224,8 +234,9 @@ class Estimator:
             lost.sort(key=lambda m: m.index)
             return Finished(Cycle(plan, (), tuple(lost), '', end), problem=str(error))
         self.nests[plan.setup] = nest
-        points, lost_points = _points(plan, nest, dwells, missing, data)
-        return Finished(Cycle(plan, points, lost_points, nest.calibration, end), nest)
+        points, lost_points, means = _points(plan, nest, dwells, missing, data)
+        cycle = Cycle(plan, points, lost_points, nest.calibration, end)
+        return Finished(cycle, nest, means=means)
 
     def _forget(self, before: int) -> None:
         self._feedback.forget(before)
@@ -251,9 +262,15 @@ def _points(
     dwells: list[Dwell],
     missing: list[Missing],
     data: tuple[np.ndarray, np.ndarray, np.ndarray],
-) -> tuple[tuple[CyclePoint, ...], tuple[Missing, ...]]:
-    """Sphere centres of the dwells, relative to the first of them (initial reset, Eq. 3-2)."""
-    points, lost = [], list(missing)
+) -> tuple[
+    tuple[CyclePoint, ...], tuple[Missing, ...], tuple[tuple[Dwell, Average], ...]
+]:
+    """Sphere centres of the dwells, relative to the first of them (initial reset, Eq. 3-2).
+
+    Also the poses that have none, and the mean readings of those that have some.
+    """
+    points, lost, means = [], list(missing), []
+    needed, locate = _locator(nest)
     for dwell in dwells:
         try:
             if data[1].shape[1] and data[1].shape[1] != len(nest.direction):
@@ -261,11 +278,12 @@ def _points(
                     f'{data[1].shape[1]} gauges, the nest was calibrated with '
                     f'{len(nest.direction)}'
                 )
-            mean = _mean(dwell, data, 3)
+            mean = _mean(dwell, data, needed)
+            means.append((dwell, mean))
+            position, covariance, disagreement = locate(mean)
         except NoAverageError as error:
             lost.append(Missing(dwell.index, str(error)))
             continue
-        position, covariance, disagreement = nests.centre(nest, mean)
         points.append(
             CyclePoint(
                 dwell.index, (dwell.start + dwell.end) // 2, dwell.feedback, dwell.approach,
@@ -275,4 +293,14 @@ def _points(
     if points:
         reset = points[0].displacement
         points = [replace(p, displacement=p.displacement - reset) for p in points]
-    return tuple(points), tuple(sorted(lost, key=lambda m: m.index))
+    return tuple(points), tuple(sorted(lost, key=lambda m: m.index)), tuple(means)
+
+
+def _locator(
+    nest: NestCalibration,
+) -> tuple[int, Callable[[Average], tuple[np.ndarray, np.ndarray, float]]]:
+    """How many gauges a sphere centre needs, and what finds it from their mean readings."""
+    if nest.kind is NestKind.LASER:
+        # The correction belongs to all the lasers together.
+        return len(nest.direction), laser.CentreSolver(nest).centre
+    return 3, partial(nests.centre, nest)

@@ -190,3 +190,12 @@ class NestCalibration:
     spot: np.ndarray = field(default_factory=lambda: np.empty((0, 3)))
     correction_nodes: np.ndarray = field(default_factory=lambda: np.empty((0, 3)))
     correction_values: np.ndarray = field(default_factory=lambda: np.empty((0, 3)))
+
+    @property
+    def sensitive(self) -> np.ndarray:
+        """(gauges, 3) unit vectors along which a small motion of the sphere is read.
+
+        Of a laser the surface normal at its spot: the beam's own direction shows in the curvature
+        of the sphere alone and is known to degrees only.
+        """
+        return self.spot / self.sphere_radius if self.kind is NestKind.LASER else self.direction

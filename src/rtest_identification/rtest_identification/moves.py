@@ -85,7 +85,8 @@ def synchronous_path(
     The rotary axes go straight to their ends and the linear ones so that the sphere goes straight,
     as seen from the table, from one nominal place to the next, which is the same one in a static
     cycle. There are as many pieces as it takes to keep the sphere within `tolerance` [m] of that.
-    Each takes as long as its slowest axis.
+    Each takes as long as its slowest axis, and no shorter than the plan's feed allows where only
+    linear axes move.
     """
     speeds = speeds or Speeds()
     count = len(machine.letters)
@@ -104,7 +105,10 @@ def synchronous_path(
     positions = np.vstack(rows)
     rotary = [machine.axes[name].rotary if name in machine.axes else True for name in plan.axes]
     limit = np.where(rotary, speeds.rotary, speeds.linear)
-    time = np.maximum((np.abs(np.diff(positions, axis=0)) / limit).max(axis=1), _SHORTEST)
+    steps = np.diff(positions, axis=0)
+    time = np.maximum((np.abs(steps) / limit).max(axis=1), _SHORTEST)
+    if plan.feed > 0.0 and not steps[:, rotary].any():
+        time = np.maximum(time, np.linalg.norm(steps, axis=1) / plan.feed)
     return AxisPath(positions, np.concatenate(poses), np.r_[0.0, time])
 
 

@@ -241,7 +241,9 @@ def _poses(
                 lines.append(f'M19 R{round(angle, 3) % 360.0:.3f}')
             # No message: LinuxCNC keeps some twenty for a screen to fetch, and where there is none
             # each further one holds the program, and what it tells of itself, for 5 s.
-            lines += [f'(POSE {pose})', controller.dwell(plan.dwell)]
+            lines.append(f'(POSE {pose})')
+            if plan.dwell > 0.0:
+                lines.append(controller.dwell(plan.dwell))
             if settings.pause:
                 lines.append('M0')
     return lines

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from rtest_estimation.errors import UserError
+from rtest_estimation.laser.verification import cube, verification_positions
 from rtest_estimation.records import CyclePlan, Kind
 from rtest_identification.kinematics import linear_positions
 from rtest_identification.machine import Machine
@@ -38,6 +39,67 @@ def nest_calibration(
             offset = step * np.eye(len(start))[machine.letters.index(name)]
             rows += [start, start + offset, start - offset]
     return _plan(machine, Kind.NEST_CALIBRATION, setup, 'nest', sphere, [*rows, start], dwell)
+
+
+def laser_calibration(
+    machine: Machine, setup: str, sphere: np.ndarray, edge: float = 1e-3, dwell: float = 0.3
+) -> CyclePlan:
+    """The 27 points of a cube (section 5.4.3), its middle also first and last; rotaries at 0.
+
+    edge, sphere in m, dwell in s.
+    """
+    commands = _stepped(machine, sphere, cube(edge, (3, 3, 3)))
+    return _plan(machine, Kind.NEST_CALIBRATION, setup, 'nest', sphere, commands, dwell)
+
+
+def laser_verification(
+    machine: Machine, setup: str, sphere: np.ndarray, edge: float = 1e-3, dwell: float = 0.2
+) -> CyclePlan:
+    """The 1,183 points of section 5.6.3, the middle of their cube also first and last.
+
+    A static cycle in which no rotary axis moves: `observations.stack` leaves it out.
+    """
+    commands = _stepped(machine, sphere, verification_positions(edge))
+    return _plan(machine, Kind.STATIC, setup, 'verification', sphere, commands, dwell)
+
+
+def laser_scan(
+    machine: Machine,
+    setup: str,
+    sphere: np.ndarray,
+    number: int,
+    direction: np.ndarray,
+    half: float,
+    pitch: float,
+    feed: float,
+) -> CyclePlan:
+    """Lines over the top of the sphere, across the beam of one laser (section 5.3.3-(2)).
+
+    number : of the laser, from 1
+    direction : (3,) unit vector from the sphere to the laser, frame ``table`` at B = C = 0
+    half : half the length of the lines and half the width of all [m]; pitch : between them [m]
+    feed : [m/s]
+    """
+    level = np.cross(direction, [0.0, 0.0, 1.0])
+    # Along the plane of the optics of a laser that stands level; of a vertical one along X.
+    along = level / np.linalg.norm(level) if np.linalg.norm(level) > 1e-3 else np.eye(3)[0]
+    across = np.cross(direction, along)
+    lines = np.linspace(-half, half, 2 * round(half / pitch) + 1)
+    ends = [
+        sign * half * along + line * across
+        for row, line in enumerate(lines)
+        for sign in ((-1, 1) if row % 2 == 0 else (1, -1))
+    ]
+    commands = _stepped(machine, sphere, np.array(ends))
+    return _plan(
+        machine, Kind.DYNAMIC, setup, f'scan-{number}', sphere, commands, 0.0, feed
+    )
+
+
+def _stepped(machine: Machine, sphere: np.ndarray, offsets: np.ndarray) -> np.ndarray:
+    """(n + 2, axes) rotaries at 0, the sphere at its nominal place, off it by (n, 3) [m], back."""
+    places = np.asarray(sphere, dtype=float) + np.vstack([np.zeros(3), offsets, np.zeros(3)])
+    return linear_positions(machine, places, np.zeros((len(places), len(machine.letters))))
 
 
 def spindle_runout(
@@ -132,10 +194,11 @@ def _plan(
     sphere: np.ndarray,
     commands: Any,
     dwell: float,
+    feed: float = 0.0,
 ) -> CyclePlan:
     return CyclePlan(
         0, '', f'{setup}-{suffix}', kind, setup, np.asarray(sphere, dtype=float),
-        machine.letters, np.array(commands, dtype=float), dwell,
+        machine.letters, np.array(commands, dtype=float), dwell, feed,
     )
 
 

@@ -11,9 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from rtest_estimation.dwell import DwellRules
 from rtest_estimation.errors import UserError
-from rtest_estimation.records import CyclePlan, Kind
+from rtest_estimation.records import CyclePlan, Kind, NestKind
 from rtest_estimation.yaml_text import read_yaml
 from rtest_identification.machine import Axis, Machine, load_machine
 from rtest_identification.moves import Approach, Speeds
@@ -22,10 +21,10 @@ from rtest_identification.plans import (
     UNEVEN_DEG,
     check_ranges,
     diagnostic,
-    nest_calibration,
     spindle_runout,
     static,
 )
+from rtest_identification.session_nest import DWELL_S, calibration_plan, laser_checks, nest_kind
 from rtest_identification.session_reader import Reader
 
 STATIC, DIAGNOSTIC = 'static', 'diagnostic'
@@ -33,9 +32,6 @@ STATIC, DIAGNOSTIC = 'static', 'diagnostic'
 FEWEST_STATIONS = 3
 # Closer ones are one pose for the machine and for who looks for its stops.
 CLOSEST_DEG = 0.1
-# What can be meant: half of a dwell at least is used; steps that the gauges see and reach.
-_DWELL_S = (2.0 * DwellRules().settle, 60.0)
-_STEP_MM = (0.05, 5.0)
 _RADIUS_MM = (1.0, 100.0)
 # Six points tell a circle from noise.
 _RUNOUT_STATIONS = (6, 360)
@@ -43,7 +39,7 @@ _NAME = re.compile(r'[A-Za-z0-9][A-Za-z0-9._-]*')
 _BUILD = {STATIC: static, DIAGNOSTIC: diagnostic}
 _KEYS = {
     'machine', 'sphere_radius_mm', 'cycle', 'nest_calibration', 'spindle_runout', 'setups',
-    'moves', 'table', 'spindle', 'devices',
+    'moves', 'table', 'spindle', 'devices', 'nest', 'verification', 'scan',
 }
 # The drivers that a session can start; what their backends are is the drivers' affair.
 _DRIVERS = ('gauges', 'cnc')
@@ -70,6 +66,7 @@ class SessionConfig:
     """What is to be measured in a session.
 
     sphere_radius : [m]
+    nest : of contact gauges or of lasers
     plans : in order, each with stamp 0 and an empty session name until it is started
     kind : of the cycle, 'static' or 'diagnostic'
     stations : of each rotary axis [rad], outer one first
@@ -81,6 +78,7 @@ class SessionConfig:
 
     machine: Machine
     sphere_radius: float
+    nest: NestKind
     plans: tuple[CyclePlan, ...]
     kind: str
     stations: tuple[np.ndarray, ...]
@@ -109,9 +107,7 @@ def load_session(path: Path | str, kind: str | None = None) -> SessionConfig:
     machine = load_machine(path.parent / str(reader.required('machine')))
     radius = reader.number('sphere_radius_mm', 12.7, _RADIUS_MM) * 1e-3
     kind, stations, dwell = _cycle(reader, machine, kind)
-    nest = reader.section('nest_calibration', {'step_mm', 'dwell_s'})
-    step = nest.number('step_mm', 1.0, _STEP_MM) * 1e-3
-    nest_dwell = nest.number('dwell_s', 0.3, _DWELL_S)
+    nest = nest_kind(reader)
     plans: list[CyclePlan] = []
     setups = reader.required('setups')
     if not isinstance(setups, dict) or not setups:
@@ -120,13 +116,15 @@ def load_session(path: Path | str, kind: str | None = None) -> SessionConfig:
         setup = Reader(f'{path}: setups: {name}', spec if isinstance(spec, dict) else {})
         setup.only({'sphere_mm'})
         sphere = np.array(setup.numbers('sphere_mm', 3)) * 1e-3
-        plans.append(nest_calibration(machine, name, sphere, step, nest_dwell))
+        plans.append(calibration_plan(reader, nest, machine, name, sphere))
+        if len(plans) == 1:
+            plans += laser_checks(reader, nest, machine, name, sphere)
         if not any(plan.kind is Kind.SPINDLE_RUNOUT for plan in plans):
             runout = data.get('spindle_runout')
             if runout is not None:
                 section = reader.section('spindle_runout', {'stations', 'dwell_s'})
                 count = section.integer('stations', 24, _RUNOUT_STATIONS)
-                runout_dwell = section.number('dwell_s', 0.3, _DWELL_S)
+                runout_dwell = section.number('dwell_s', 0.3, DWELL_S)
                 plans.append(spindle_runout(machine, name, sphere, count, runout_dwell))
         plans.append(_BUILD[kind](machine, name, sphere, *stations, dwell))
     for plan in plans:
@@ -135,7 +133,7 @@ def load_session(path: Path | str, kind: str | None = None) -> SessionConfig:
         except UserError as error:
             raise UserError(f'{path}: setups: {plan.setup}: {error}') from None
     return SessionConfig(
-        machine, radius, tuple(plans), kind, stations, _speeds(reader), _approach(reader),
+        machine, radius, nest, tuple(plans), kind, stations, _speeds(reader), _approach(reader),
         _table(reader), _spindle(reader), _devices(reader, path.parent), data,
     )
 
@@ -158,7 +156,7 @@ def _cycle(
             stations.append(np.radians(UNEVEN_DEG))
         else:
             stations.append(np.radians(_stations(cycle, key, machine.axes[name])))
-    return kind, tuple(stations), cycle.number('dwell_s', 0.3, _DWELL_S)
+    return kind, tuple(stations), cycle.number('dwell_s', 0.3, DWELL_S)
 
 
 def _stations(cycle: Reader, key: str, axis: Axis) -> list[float]:

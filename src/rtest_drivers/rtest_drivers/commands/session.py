@@ -117,7 +117,8 @@ def measure(
     # Mistakes in the files are told before anything is started.
     config = load_session(settings.config)
     settings = replace(
-        settings, sphere_radius=config.sphere_radius, devices=config.devices
+        settings, sphere_radius=config.sphere_radius, nest=config.nest.name.lower(),
+        devices=config.devices,
     )
     simulated = settings.simulate is not None
     if simulated:

@@ -405,8 +405,10 @@ class SessionNode(Node):
 
     def _judge(self, started: dict[str, list[tuple[str, int]]]) -> None:
         """A cycle that says nothing is a problem; single missing poses are not."""
+        kinds = {plan.cycle: plan.kind for plan in self.config.plans}
         lost = [
             name for name, keys in started.items()
+            if kinds[name] is not Kind.DYNAMIC
             # Displacements count from the first point: alone it is zero.
             if not any(key in self._cycles and len(self._cycles[key].points) > 1 for key in keys)
         ]

@@ -13,9 +13,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rtest_drivers.sim import gauges
+from rtest_drivers.sim import gauges, laser
 from rtest_drivers.sim.faults import Window, timed, window
-from rtest_drivers.sim.kinematics import sphere_in_table
+from rtest_drivers.sim.kinematics import sphere_in_table, table_to_spindle, turn
 from rtest_drivers.sim.motion import SPINDLE, Timeline
 from rtest_drivers.sim.truth import Truth
 from rtest_estimation.errors import UserError
@@ -53,7 +53,7 @@ class Cell:
         self._plans: deque[CyclePlan] = deque()
         self._run: Run | None = None
         self._setup: str | None = None
-        self._nests: list[gauges.Nest] = []
+        self._nests: list[gauges.Nest | laser.LaserNest] = []
         self._windows: list[Window] = timed(truth.faults, epoch)
         self._reading = 0
         self._sequence = 0
@@ -140,6 +140,8 @@ class Cell:
             offset = self.truth.gauges.dwell_noise * self._named(
                 f'{plan.cycle}/{pose}'
             ).standard_normal(3)
+            # A dynamic cycle goes at its feed from pose to pose, without a stop.
+            feed = plan.feed if plan.kind is Kind.DYNAMIC and pose else None
             if plan.setup != self._setup:
                 self._setup = plan.setup
                 leg = self._timeline.append(clock, target, -1, offset)
@@ -148,7 +150,7 @@ class Cell:
                 self._timeline.rest(clock, len(self._nests) - 1, offset)
             else:
                 clock = self._timeline.append(
-                    clock, target, len(self._nests) - 1, offset
+                    clock, target, len(self._nests) - 1, offset, feed
                 ).arrival
             poses[pose] = (clock, clock + dwell)
             clock += dwell
@@ -218,11 +220,14 @@ class Cell:
         mounted = state.nest >= 0
         if mounted.any():
             sphere = self._sphere(state.positions[mounted]) + state.offset[mounted]
-            readings = np.empty((len(sphere), shape[1]))
+            surface = self._to_sphere(state.positions[mounted]) if data.laser else None
+            held, found = values[mounted], status[mounted]
             for index in np.unique(state.nest[mounted]):
                 rows = state.nest[mounted] == index
-                readings[rows] = self._nests[index].read(sphere[rows])
-            values[mounted], status[mounted] = gauges.limit(data, readings + noise[mounted])
+                held[rows], found[rows] = self._nests[index].measure(
+                    sphere[rows], noise[mounted][rows], None if surface is None else surface[rows]
+                )
+            values[mounted], status[mounted] = held, found
         return self._spoil(times, values, status)
 
     def _sphere(self, positions: np.ndarray) -> np.ndarray:
@@ -231,6 +236,12 @@ class Cell:
         x, y = self.truth.runout
         runout = np.column_stack([x * cosine - y * sine, x * sine + y * cosine, 0.0 * sine])
         return sphere_in_table(self.truth.machine, positions[:, :-1], self.truth.errors, runout)
+
+    def _to_sphere(self, positions: np.ndarray) -> np.ndarray:
+        """(n, 3, 3) from the table to the sphere, which turns with the spindle; nominal."""
+        machine = self.truth.machine
+        spindle = turn(np.array([0.0, 0.0, 1.0]), -positions[:, -1])[:, :3, :3]
+        return spindle @ table_to_spindle(machine, positions[:, :-1])
 
     def _spoil(
         self, times: np.ndarray, values: np.ndarray, status: np.ndarray
@@ -267,6 +278,13 @@ class Cell:
         positions += self._encoder_noise.standard_normal(positions.shape) * [
             *noise, data.rotary_noise
         ]
+        step = np.array([
+            data.rotary_step if name == SPINDLE or machine.axes[name].rotary else data.linear_step
+            for name in self.axes
+        ])
+        if step.any():
+            stepped = np.round(positions / np.where(step, step, 1.0)) * step
+            positions = np.where(step, stepped, positions)
         stale = self._active('feedback_stale', times)
         silent = self._active('feedback_silent', times)
         for index, time in enumerate(times):
@@ -284,9 +302,11 @@ def check(plan: CyclePlan, truth: Truth) -> None:
     Raises UserError naming cycle, axis, pose and what is expected.
     """
     where = f'plan {plan.cycle!r}'
-    if plan.kind is Kind.DYNAMIC:
-        raise UserError(f'{where}: the simulated cell does static cycles, not dynamic ones')
     axes = truth.machine.axes
+    rotary = [column for column, name in enumerate(plan.axes)
+              if name not in axes or axes[name].rotary]
+    if plan.kind is Kind.DYNAMIC and np.ptp(plan.commands[:, rotary], axis=0).any():
+        raise UserError(f'{where}: the simulated cell does dynamic cycles of linear axes only')
     for column, name in enumerate(plan.axes):
         if name == SPINDLE:
             continue

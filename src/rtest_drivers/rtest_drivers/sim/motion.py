@@ -95,11 +95,21 @@ class Timeline:
         """The leg that ends all others."""
         return self._legs[-1]
 
-    def append(self, start: int, target: np.ndarray, nest: int, offset: np.ndarray) -> Leg:
-        """Go to `target` (k,) from wherever the last leg ends, leaving at `start` [ns]."""
+    def append(
+        self,
+        start: int,
+        target: np.ndarray,
+        nest: int,
+        offset: np.ndarray,
+        feed: float | None = None,
+    ) -> Leg:
+        """Go to `target` (k,) from wherever the last leg ends, leaving at `start` [ns].
+
+        feed : largest speed of a linear axis in place of that of the drives [m/s]
+        """
         last = self.last
         sphere = self._sphere(target)
-        duration = self._duration(last.end, target, last.sphere_end, sphere)
+        duration = self._duration(last.end, target, last.sphere_end, sphere, feed)
         leg = Leg(
             start, duration, last.end, np.array(target, dtype=float), last.sphere_end, sphere,
             nest, last.offset_end, np.asarray(offset, dtype=float),
@@ -152,7 +162,12 @@ class Timeline:
         return sphere_in_table(self._machine, positions[None, :letters])[0]
 
     def _duration(
-        self, begin: np.ndarray, end: np.ndarray, sphere: np.ndarray, sphere_end: np.ndarray
+        self,
+        begin: np.ndarray,
+        end: np.ndarray,
+        sphere: np.ndarray,
+        sphere_end: np.ndarray,
+        feed: float | None,
     ) -> float:
         if np.abs(end - begin).max() < 1e-12:
             return 0.0
@@ -164,7 +179,7 @@ class Timeline:
         )
         slope = np.abs(np.diff(path, axis=0)).max(axis=0) * (len(share) - 1)
         limit = np.full(len(self.axes), self._drives.rotary)
-        limit[self._linear] = self._drives.linear
+        limit[self._linear] = self._drives.linear if feed is None else feed
         wanted = max(self._drives.shortest, float((slope / limit).max()) * _PEAK)
         # Whole microseconds: stamps are integers, and a leg must not end between two of them.
         return math.ceil(wanted * 1e6) * 1e-6

@@ -17,7 +17,8 @@ import numpy as np
 from rtest_drivers.sim.errors import GeometricErrors, parse_errors
 from rtest_drivers.sim.faults import Fault, parse_faults
 from rtest_drivers.sim.fields import Fields, read_yaml
-from rtest_drivers.sim.gauges import GaugeData
+from rtest_drivers.sim.gauges import GaugeData, LaserData
+from rtest_drivers.sim.laser import SENSORS
 from rtest_drivers.sim.model import load_motions
 from rtest_drivers.sim.motion import Drives
 from rtest_estimation.errors import UserError
@@ -28,11 +29,13 @@ _UM, _MS, _DEG, _MM = 1e-6, 1e-3, math.pi / 180.0, 1e-3
 
 @dataclass(frozen=True)
 class Encoders:
-    """Encoder feedback: period [ns], white noise of linear [m] and rotary axes [rad]."""
+    """Encoder feedback: period [ns]; of linear [m] and rotary axes [rad] white noise and steps."""
 
     period: int
     linear_noise: float
     rotary_noise: float
+    linear_step: float = 0.0
+    rotary_step: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -93,16 +96,29 @@ def _gauges(fields: Fields) -> GaugeData:
     tilt = np.array([entry.number('tilt_deg', scale=_DEG) for entry in entries])
     for entry in entries:
         entry.done()
-    lower, upper = fields.numbers('range_mm', 2, _MM)
-    if not lower < 0.0 < upper:
-        raise UserError(f'{fields.where}: range_mm: expected [lower, upper] around 0')
+    sensor = fields.choice('sensor', SENSORS, None)
+    lasers, position_error = None, 0.0
+    if sensor is None:
+        lower, upper = fields.numbers('range_mm', 2, _MM)
+        if not lower < 0.0 < upper:
+            raise UserError(f'{fields.where}: range_mm: expected [lower, upper] around 0')
+        position_error = fields.number('position_error_um', 0.0, 0.0, _UM)
+        noise = fields.number('noise_um', 0.0, 0.0, _UM)
+    else:
+        lasers = LaserData(
+            SENSORS[sensor],
+            fields.number('sphere_radius_mm', lower=1.0, scale=_MM),
+            fields.number('aim_error_um', 0.0, 0.0, _UM),
+            fields.number('distance_error_um', 0.0, 0.0, _UM),
+        )
+        lower, upper, noise = lasers.sensor.lower, lasers.sensor.upper, lasers.sensor.noise
     outliers = fields.section('outliers')
     data = GaugeData(
         azimuth,
         tilt,
         fields.number('direction_error_deg', 0.0, 0.0, _DEG),
-        fields.number('position_error_um', 0.0, 0.0, _UM),
-        fields.number('noise_um', 0.0, 0.0, _UM),
+        position_error,
+        noise,
         fields.number('dwell_noise_um', 0.0, 0.0, _UM),
         lower,
         upper,
@@ -110,6 +126,7 @@ def _gauges(fields: Fields) -> GaugeData:
         fields.integer('batch', 1, lower=1),
         outliers.number('share', 0.0, 0.0),
         outliers.number('size_um', 0.0, 0.0, _UM),
+        lasers,
     )
     outliers.done()
     fields.done()
@@ -123,6 +140,8 @@ def _encoders(fields: Fields) -> Encoders:
         _period(fields),
         fields.number('linear_noise_um', 0.0, 0.0, _UM),
         fields.number('rotary_noise_urad', 0.0, 0.0, 1e-6),
+        fields.number('linear_step_um', 0.0, 0.0, _UM),
+        fields.number('rotary_step_urad', 0.0, 0.0, 1e-6),
     )
     fields.done()
     return encoders

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import sys
 from collections import Counter
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+import rclpy
 from geometry_msgs.msg import PointStamped
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
@@ -14,14 +16,20 @@ from rtest_msgs.msg import Cycle, CyclePlan, GaugeSamples, NestCalibration
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
-from rtest_estimation import messages, nest
+from rtest_estimation import messages
+from rtest_estimation import nest as nests
 from rtest_estimation.dwell import DwellRules
+from rtest_estimation.errors import UserError
+from rtest_estimation.laser import CentreSolver, CentreStatus
 from rtest_estimation.nodes import diagnostics, publish
 from rtest_estimation.nodes.qos import LATCHED, LATCHED_100, STREAM
 from rtest_estimation.nodes.run import run, when_time_goes_back
 from rtest_estimation.pipeline import EstimationRules, Estimator, Finished
-from rtest_estimation.records import GaugeBlock, Status
+from rtest_estimation.records import GaugeBlock, NestKind, Status
+from rtest_estimation.records import NestCalibration as NestRecord
 from rtest_estimation.sequence import SequenceCheck
+
+_KINDS = {'contact': NestKind.CONTACT, 'laser': NestKind.LASER}
 
 
 class EstimatorNode(Node):
@@ -33,7 +41,12 @@ class EstimatorNode(Node):
         settle = self.declare_parameter('settle_s', DwellRules().settle).value
         # The stream is for eyes and plots; finished cycles use every reading.
         self._centre_period = 1e9 / self.declare_parameter('sphere_centre_hz', 100.0).value
-        self._rules = EstimationRules(DwellRules(settle=float(settle)), float(radius) * 1e-3)
+        kind = self.declare_parameter('nest', 'contact').value
+        if kind not in _KINDS:
+            raise UserError(f'parameter nest: expected {" or ".join(_KINDS)}, got {kind!r}')
+        self._rules = EstimationRules(
+            DwellRules(settle=float(settle)), float(radius) * 1e-3, _KINDS[kind]
+        )
         self._last: Finished | None = None
         self._begin()
         self._back = when_time_goes_back(self, self._begin)
@@ -54,6 +67,7 @@ class EstimatorNode(Node):
         self._estimator = Estimator(self._rules)
         self._received: Counter[str] = Counter()
         self._centre_due = 0
+        self._solver: CentreSolver | None = None
         self._damaged: list[str] = []
         self._sequence = SequenceCheck()
         # Readings that were lost before the current cycle.
@@ -86,17 +100,38 @@ class EstimatorNode(Node):
     def _add_gauges(self, block: GaugeBlock) -> None:
         self._estimator.add_gauges(block)
         self._sequence.add(block.stamp, block.sequence, len(block.displacement))
-        calibration = self._estimator.nest
-        if calibration is None or block.displacement.shape[1] != len(calibration.direction):
+        nest = self._estimator.nest
+        if nest is None or block.displacement.shape[1] != len(nest.direction):
             return
         good = (block.status == Status.VALID).all(axis=1)
         good &= np.isfinite(block.displacement).all(axis=1)
-        centres = nest.centres(calibration, block.displacement)
-        for stamp, centre in zip(block.stamps[good].tolist(), centres[good], strict=True):
-            if stamp >= self._centre_due:
-                self._centre_due = stamp + int(0.99 * self._centre_period)
+        rows = self._due(block.stamps, np.flatnonzero(good))
+        centres = self._centres(nest, block.displacement[rows])
+        for stamp, centre in zip(block.stamps[rows].tolist(), centres, strict=True):
+            if np.isfinite(centre).all():
                 header = publish.header(stamp, 'table')
                 self._centre.publish(PointStamped(header=header, point=publish.point(centre)))
+
+    def _due(self, stamps: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        """Which of these rows of a block are to be seen: of each period the newest."""
+        rows = rows[stamps[rows] >= self._centre_due]
+        if len(rows):
+            # A little less than the period, or a jitter of the stamps would leave every other out.
+            period = int(0.99 * self._centre_period)
+            slot = (stamps[rows] - max(self._centre_due, int(stamps[rows[0]]))) // period
+            rows = rows[np.append(slot[1:] != slot[:-1], True)]
+            self._centre_due = int(stamps[rows[-1]]) + period
+        return rows
+
+    def _centres(self, nest: NestRecord, readings: np.ndarray) -> np.ndarray:
+        """(n, 3) sphere centres [m]; NaN where a laser nest is not calibrated."""
+        if nest.kind is not NestKind.LASER:
+            return nests.centres(nest, readings)
+        if self._solver is None or self._solver.nest is not nest:
+            self._solver = CentreSolver(nest)
+        found, status = self._solver(readings)
+        found[status != CentreStatus.VALID] = np.nan
+        return found
 
     def _drain(self) -> None:
         while (ready := self._estimator.finished()) is not None:
@@ -165,8 +200,13 @@ class EstimatorNode(Node):
 
 
 def main(args: list[str] | None = None) -> int:
-    """Entry point."""
-    return run(EstimatorNode, args)
+    """Entry point; a user's mistake is one line on stderr and status 2."""
+    try:
+        return run(EstimatorNode, args)
+    except UserError as error:
+        print(error, file=sys.stderr)
+        rclpy.try_shutdown()
+        return 2
 
 
 if __name__ == '__main__':
