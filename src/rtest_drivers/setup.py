@@ -27,6 +27,7 @@ setup(
             'rtest = rtest_drivers.cli:main',
             'gauges = rtest_drivers.nodes.gauges:main',
             'cnc = rtest_drivers.nodes.cnc:main',
+            'thermometers = rtest_drivers.nodes.thermometers:main',
             'recorder = rtest_drivers.nodes.recorder:main',
             'session = rtest_drivers.nodes.session:main',
             'cell = rtest_drivers.nodes.cell:main',
