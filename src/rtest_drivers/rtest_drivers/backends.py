@@ -21,6 +21,7 @@ from rtest_drivers.cnc.linuxcnc import LinuxCnc
 from rtest_drivers.cnc.mtconnect import MtConnect
 from rtest_drivers.cnc.opcua import OpcUa
 from rtest_drivers.gauges.nest import SerialNest
+from rtest_drivers.thermometers.serial_thermometers import SerialThermometers
 from rtest_estimation.errors import UserError
 from rtest_estimation.records import Feedback, GaugeBlock, Temperature
 
@@ -107,7 +108,7 @@ CNC_BACKENDS: dict[str, Callable[[str], CncBackend]] = {
     CELL: CellCnc, 'linuxcnc': LinuxCnc, 'mtconnect': MtConnect, 'opcua': OpcUa,
 }
 THERMOMETER_BACKENDS: dict[str, Callable[[str], ThermometerBackend]] = {
-    CELL: CellThermometers,
+    CELL: CellThermometers, 'serial': SerialThermometers,
 }
 
 _Backend = TypeVar('_Backend')

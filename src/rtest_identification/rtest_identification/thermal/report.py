@@ -73,7 +73,7 @@ def _draw(result: Thermal, out: Path) -> dict[str, Picture]:
             'Change of each error since the reference cycle; bars are U (k = 2), side by side '
             'within a cycle. Filled: drifts beyond U, with the exponential that fits (dashed '
             'where its time constant is not determined). Hollow: no more than noise makes of so '
-            'many errors.')
+            'many errors. A level that all cycles but the reference share is its noise.')
         _add_positions(result, add)
     against = figures.against_temperature(result)
     if against is not None:
@@ -87,7 +87,8 @@ def _draw(result: Thermal, out: Path) -> dict[str, Picture]:
             f'What {axis} does at each of its stations, change since the reference cycle: '
             'constant error and error map together, in the frame of the axis that carries '
             f'{axis}. Lines: cycles; grey: U (k = 2) about zero. Lines that stay parallel shift '
-            f'as a whole; what changes its shape depends on {axis}.')
+            f'as a whole; what changes its shape from cycle to cycle depends on {axis}. A shape '
+            'that all lines share is the noise of the reference cycle.')
     return made
 
 
