@@ -80,11 +80,14 @@ def evaluate(
 
 
 def _lines(result: Thermal) -> list[str]:
-    """Warnings, and what is known of every error that drifts."""
+    """Warnings, temperatures, and what is known of every error that drifts."""
     from rtest_identification.thermal import words
 
     lines = [f'missing: {line}' for line in words.missing(result)]
     lines += [f'warning: {warning}' for warning in result.warnings]
+    for one in result.thermometers:
+        if change := words.warming(result, one):
+            lines.append(f'{one.sensor}: {change}')
     for one in result.drifting:
         lines.append(words.drift(one))
         lines += [f'  time constant {words.tau(c)}' for c in one.constants]

@@ -44,7 +44,7 @@ def write_report(result: Thermal, out: Path) -> Path:
     page = environment.get_template('thermal.html.j2').render(
         result=result, pictures=pictures, words=words, summary=words.summary(result),
         drifts=[_drift_row(one, result) for one in result.errors],
-        sensors=_sensor_rows(result), cycles=_cycle_rows(result),
+        sensors=_sensor_rows(result), warming=_warming_rows(result), cycles=_cycle_rows(result),
         within=[_within_row(one) for one in result.within],
         plotly=get_plotlyjs() if any(p.script for p in pictures.values()) else '',
     )
@@ -149,6 +149,18 @@ def _sensor_rows(result: Thermal) -> list[dict[str, Any]]:
                 'explained': f'{100.0 * d.explained:.1f} %',
                 'best': one.best is not None and d.sensor == one.best.sensor,
             })
+    return rows
+
+
+def _warming_rows(result: Thermal) -> list[dict[str, str]]:
+    rows = []
+    for one in result.thermometers:
+        start = float(result.during_cycles(one)[0][result.place])
+        rows.append({
+            'sensor': one.sensor,
+            'start': '' if np.isnan(start) else f'{start:.2f}',
+            'change': words.warming(result, one),
+        })
     return rows
 
 
