@@ -28,7 +28,7 @@ def found(name):
 def test_every_bag_is_described_and_read():
     readme = (BAGS / 'README.md').read_text()
     bags = sorted(path.parent.name for path in BAGS.glob('*/metadata.yaml'))
-    assert bags == ['open-01', 'short']
+    assert bags == ['open-01', 'short', 'thermal']
     for name in bags:
         assert f'`{name}`' in readme
         assert read_recording(BAGS / name).closed

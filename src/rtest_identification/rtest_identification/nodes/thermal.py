@@ -144,7 +144,8 @@ class ThermalNode(Node):
         # Drawing takes seconds, and what comes meanwhile must not wait; it is drawn afterwards.
         if self._due and not self._drawing.is_alive():
             self._evaluate()
-            if self._out and self._result is not None:
+            # Of one cycle there is nothing to show yet.
+            if self._out and self._result is not None and len(self._result.cycles) > 1:
                 self._drawing = Thread(target=self._draw, args=(self._result,), daemon=True)
                 self._drawing.start()
         warnings = self._result.warnings if self._result else ()

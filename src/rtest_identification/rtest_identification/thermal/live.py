@@ -17,7 +17,8 @@ from rtest_identification.thermal.temperature import Thermometer
 class LiveSession:
     """Finished cycles and temperatures of one session, in the order in which they came.
 
-    What `result` gives is what `thermal_recording` gives from the recording of the same messages.
+    What `result` gives is what `thermal_recording` gives from the recording of the same messages,
+    but for the reasons of missing poses, which finished cycles do not carry.
     """
 
     def __init__(self) -> None:
