@@ -32,16 +32,15 @@ pytestmark = [
     pytest.mark.skipif(not find_spec('rclpy'), reason='needs ROS 2'),
 ]
 
-# The second cycle waits for its time; the third is due before the second has come to its end.
 SESSION = """
 machine: {machine}
-cycle: {{kind: thermal, every_min: 0.5, hours: 0.017, b_deg: [-60, 0, 60],
+cycle: {{kind: thermal, every_min: 0.5, hours: 0.01, b_deg: [-60, 0, 60],
         c_deg: [0, 90, 180, 270], dwell_s: 0.3}}
 nest_calibration: {{step_mm: 1.0, dwell_s: 0.3}}
 setups:
   low: {{sphere_mm: [0, -90.0, 40.6]}}
 """
-FAULT = '{kind: feedback_silent, cycle: low-thermal-02, pose: 8, for_s: 40}'
+FAULT = '{kind: pose_skipped, cycle: low-thermal-02, pose: 8}'
 FILE = r"""
 controllers:
   - {port: PORT, unit: degC, stddev_k: 0.1, rate_hz: 10, timeout_s: 0.2, terminator: "\r",
@@ -66,20 +65,19 @@ def test_a_thermal_session_from_the_cell_to_the_report(tmp_path: Path) -> None:
     )
     out = done.stdout
     assert done.returncode == 0, out + done.stderr
-    assert re.search(r'3/4 low-thermal-02: in 0\.\d min', out)
-    assert re.search(r'3/4 low-thermal-02: \d+ of 14 poses, \d+ missing', out)
-    assert re.search(r'4/4 low-thermal-03: \d\.\d min late: the cycle before', out)
-    assert re.search(r'thermal: 3 cycles in \d min', out)
-    assert out.splitlines()[-1].startswith('warm: 3 cycles in ')
+    assert re.search(r'3/3 low-thermal-02: in 0\.\d min', out)
+    assert '3/3 low-thermal-02: 13 of 14 poses, 1 missing' in out
+    assert re.search(r'thermal: 2 cycles in \d min', out)
+    assert out.splitlines()[-1].startswith('warm: 2 cycles in ')
     recording = read_recording(tmp_path / 'warm')
     assert recording.closed and recording.lost == 0
     starts = [plan.stamp for plan in recording.plans[1:]]
-    assert starts[1] - starts[0] == 30 * 10**9 and starts[2] - starts[0] > 60 * 10**9
+    assert starts[1] - starts[0] == 30 * 10**9
     result = thermal_recording(tmp_path / 'warm')
     assert [one.sensor for one in result.thermometers] == [
         'B_cover', 'ambient', 'bridge', 'nest', 'table',
     ]
-    assert [len(cycle.points) for cycle in result.cycles][::2] == [14, 14]
+    assert [len(cycle.points) for cycle in result.cycles] == [14, 13]
     folder = tmp_path / 'warm' / 'thermal'
     assert json.loads((folder / 'thermal.json').read_text()) == json.loads(
         json.dumps(as_dict(result))

@@ -45,7 +45,7 @@ from std_srvs.srv import Trigger
 from rtest_drivers.clock import HostClock
 from rtest_drivers.cnc.programs import program_of, start_program
 from rtest_drivers.graph import INCOMPLETE
-from rtest_drivers.schedule import NANOSECONDS, STOPPED_S, Progress, pose_count
+from rtest_drivers.schedule import NANOSECONDS, STOPPED_S, Progress, pose_count, turn
 from rtest_estimation.errors import UserError
 from rtest_estimation.missing import grouped
 from rtest_estimation.nodes import diagnostics, publish
@@ -81,8 +81,6 @@ ENDED_S = 5.0
 # The CNC driver tells its state as often, twice over [s].
 HEARD_S = 1.0
 REPEAT, SKIP = 'repeat', 'skip'
-# A repeated cycle that begins so much after its time is late [s].
-LATE_S = 5.0
 # What the CNC driver says where no NC program runs.
 IDLE = 'IDLE'
 
@@ -266,16 +264,12 @@ class SessionNode(Node):
 
     def _tell_turn(self, plan: CyclePlan, due: int) -> None:
         """Say when a repeated cycle is to begin, or that it is late. due : [ns], 0 for at once."""
-        ahead = (due - self._now()) / NANOSECONDS
-        if not due or abs(ahead) <= LATE_S:
-            return
-        if ahead > 0.0:
+        text, late = turn(due, self._now()) if due else ('', False)
+        if late:
+            self.get_logger().warning(f'{plan.cycle}: {text}')
+        if text:
             self._status = f'waiting for {plan.cycle}'
-            self._say_cycle(plan, f'in {ahead / 60.0:.1f} min')
-            return
-        text = f'{-ahead / 60.0:.1f} min late: the cycle before it had not finished'
-        self.get_logger().warning(f'{plan.cycle}: {text}')
-        self._say_cycle(plan, text)
+            self._say_cycle(plan, text)
 
     def _measure(self, plan: CyclePlan, due: int) -> list[tuple[str, int]]:
         """Publish one plan and wait for its finished cycle; returns its key.
