@@ -27,6 +27,7 @@ setup(
             'rtest = rtest_drivers.cli:main',
             'gauges = rtest_drivers.nodes.gauges:main',
             'cnc = rtest_drivers.nodes.cnc:main',
+            'thermometers = rtest_drivers.nodes.thermometers:main',
             'recorder = rtest_drivers.nodes.recorder:main',
             'replay = rtest_drivers.nodes.replay:main',
             'session = rtest_drivers.nodes.session:main',

@@ -79,11 +79,15 @@ class Feedback:
 
 @dataclass(frozen=True)
 class Temperature:
-    """Reading of a thermometer. stamp : [ns]; sensor : its name; value : [deg C]."""
+    """Reading of a thermometer.
+
+    stamp : [ns]; sensor : its name; value : [deg C]; variance : [K2], 0 where it is not known
+    """
 
     stamp: int
     sensor: str
     value: float
+    variance: float = 0.0
 
 
 @dataclass(frozen=True)

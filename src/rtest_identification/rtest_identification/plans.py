@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import re
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -23,6 +25,7 @@ UNEVEN_DEG = (0, 50, 60, 80, 110, 145, 160, 200, 240, 270, 315, 335)
 # How far an outermost level is overrun before it is approached from outside: more than any
 # backlash and enough to be a pose of its own, less than what counts as another station [rad].
 OVERRUN = math.radians(0.05)
+_REPEATED = re.compile(r'(.*-thermal)-\d+')
 
 
 def nest_calibration(
@@ -135,6 +138,24 @@ def static(
     poses = [(0.0, 0.0), *_sweep(outer, inner), (0.0, 0.0)]
     commands = linear_positions(machine, sphere, _rotary(machine, poses))
     return _plan(machine, Kind.STATIC, setup, 'static', sphere, commands, dwell)
+
+
+def thermal(static_cycle: CyclePlan, count: int) -> list[CyclePlan]:
+    """A static cycle again and again while the machine warms up (section 4.3).
+
+    They are named SETUP-thermal-01 and so on.
+    """
+    digits = max(2, len(str(count)))
+    return [
+        replace(static_cycle, cycle=f'{static_cycle.setup}-thermal-{number:0{digits}}')
+        for number in range(1, count + 1)
+    ]
+
+
+def program_name(cycle: str) -> str:
+    """Name of the NC program of a cycle: repeated ones share theirs."""
+    repeated = _REPEATED.fullmatch(cycle)
+    return repeated[1] if repeated else cycle
 
 
 def diagnostic(

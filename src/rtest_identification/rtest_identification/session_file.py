@@ -21,13 +21,15 @@ from rtest_identification.plans import (
     UNEVEN_DEG,
     check_ranges,
     diagnostic,
+    program_name,
     spindle_runout,
     static,
+    thermal,
 )
 from rtest_identification.session_nest import DWELL_S, calibration_plan, laser_checks, nest_kind
 from rtest_identification.session_reader import Reader
 
-STATIC, DIAGNOSTIC = 'static', 'diagnostic'
+STATIC, DIAGNOSTIC, THERMAL = 'static', 'diagnostic', 'thermal'
 # Fewer do not tell offset, sine and cosine of an error over the axis from each other.
 FEWEST_STATIONS = 3
 # Closer ones are one pose for the machine and for who looks for its stops.
@@ -36,13 +38,17 @@ _RADIUS_MM = (1.0, 100.0)
 # Six points tell a circle from noise.
 _RUNOUT_STATIONS = (6, 360)
 _NAME = re.compile(r'[A-Za-z0-9][A-Za-z0-9._-]*')
-_BUILD = {STATIC: static, DIAGNOSTIC: diagnostic}
+_BUILD = {STATIC: static, DIAGNOSTIC: diagnostic, THERMAL: static}
+# Of a thermal session: between the starts of its cycles, and from the first to the last of them.
+_EVERY_MIN, _HOURS = (0.1, 24.0 * 60.0), (0.01, 24.0 * 14.0)
+_MOST_CYCLES = 2000
+PACE = ('every_min', 'hours')
 _KEYS = {
     'machine', 'sphere_radius_mm', 'cycle', 'nest_calibration', 'spindle_runout', 'setups',
     'moves', 'table', 'spindle', 'devices', 'nest', 'verification', 'scan',
 }
 # The drivers that a session can start; what their backends are is the drivers' affair.
-_DRIVERS = ('gauges', 'cnc')
+_DRIVERS = ('gauges', 'cnc', 'thermometers')
 # Who starts the NC programs: a person, or the session; the latter goes on after their first stop
 # (M0) where that is wanted.
 BY_HAND, STARTED, UNATTENDED = 'by hand', 'started', 'unattended'
@@ -68,12 +74,14 @@ class SessionConfig:
     sphere_radius : [m]
     nest : of contact gauges or of lasers
     plans : in order, each with stamp 0 and an empty session name until it is started
-    kind : of the cycle, 'static' or 'diagnostic'
+    kind : of the cycle, 'static', 'diagnostic' or 'thermal'
     stations : of each rotary axis [rad], outer one first
     speeds, approach : how the axes move between poses, and to the first pose
     table, spindle : bodies that must not touch; None where the file says nothing of them
-    devices : of the drivers 'gauges' and 'cnc'; a driver that is not in it is started elsewhere
+    devices : of the drivers 'gauges', 'cnc' and 'thermometers'; a driver that is not in it is
+        started elsewhere
     data : the mapping that was read
+    every : from start to start of the cycles of a thermal session [s]; 0 for other sessions
     """
 
     machine: Machine
@@ -88,6 +96,22 @@ class SessionConfig:
     spindle: Spindle | None
     devices: dict[str, Device]
     data: dict[str, Any]
+    every: float = 0.0
+
+    @property
+    def distinct(self) -> tuple[CyclePlan, ...]:
+        """The plans, of a repeated cycle the first."""
+        named = {program_name(plan.cycle): plan for plan in reversed(self.plans)}
+        return tuple(reversed(named.values()))
+
+    @property
+    def repetitions(self) -> int:
+        """How often the last of them is there."""
+        return len(self.plans) - len(self.distinct) + 1
+
+    def reads_temperatures(self, simulated: bool) -> bool:
+        """Whether the session starts the thermometer driver and needs it."""
+        return self.kind == THERMAL if simulated else 'thermometers' in self.devices
 
 
 def load_session(path: Path | str, kind: str | None = None) -> SessionConfig:
@@ -108,10 +132,15 @@ def load_session(path: Path | str, kind: str | None = None) -> SessionConfig:
     radius = reader.number('sphere_radius_mm', 12.7, _RADIUS_MM) * 1e-3
     kind, stations, dwell = _cycle(reader, machine, kind)
     nest = nest_kind(reader)
+    every, repetitions = _repetition(reader, kind)
     plans: list[CyclePlan] = []
     setups = reader.required('setups')
     if not isinstance(setups, dict) or not setups:
         raise UserError(f'{path}: setups: expected a mapping of names to sphere_mm')
+    if kind == THERMAL and len(setups) > 1:
+        raise UserError(
+            f'{path}: setups: expected one, which a thermal session repeats, got {len(setups)}'
+        )
     for name, spec in zip(_names(f'{path}: setups', setups), setups.values(), strict=True):
         setup = Reader(f'{path}: setups: {name}', spec if isinstance(spec, dict) else {})
         setup.only({'sphere_mm'})
@@ -126,7 +155,8 @@ def load_session(path: Path | str, kind: str | None = None) -> SessionConfig:
                 count = section.integer('stations', 24, _RUNOUT_STATIONS)
                 runout_dwell = section.number('dwell_s', 0.3, DWELL_S)
                 plans.append(spindle_runout(machine, name, sphere, count, runout_dwell))
-        plans.append(_BUILD[kind](machine, name, sphere, *stations, dwell))
+        cycle = _BUILD[kind](machine, name, sphere, *stations, dwell)
+        plans += thermal(cycle, repetitions) if kind == THERMAL else [cycle]
     for plan in plans:
         try:
             check_ranges(machine, plan)
@@ -134,7 +164,7 @@ def load_session(path: Path | str, kind: str | None = None) -> SessionConfig:
             raise UserError(f'{path}: setups: {plan.setup}: {error}') from None
     return SessionConfig(
         machine, radius, nest, tuple(plans), kind, stations, _speeds(reader), _approach(reader),
-        _table(reader), _spindle(reader), _devices(reader, path.parent), data,
+        _table(reader), _spindle(reader), _devices(reader, path.parent), data, every,
     )
 
 
@@ -143,7 +173,7 @@ def _cycle(
 ) -> tuple[str, tuple[np.ndarray, ...], float]:
     """Kind, stations of each rotary axis [rad], dwell [s]."""
     keys = {name: f'{name.lower()}_deg' for name in machine.rotary}
-    cycle = reader.section('cycle', {'kind', 'dwell_s', *keys.values()})
+    cycle = reader.section('cycle', {'kind', 'dwell_s', *PACE, *keys.values()})
     given = cycle.data.get('kind', STATIC)
     if given not in _BUILD:
         raise UserError(f'{cycle.where}: kind: expected {" or ".join(_BUILD)}, got {given!r}')
@@ -157,6 +187,27 @@ def _cycle(
         else:
             stations.append(np.radians(_stations(cycle, key, machine.axes[name])))
     return kind, tuple(stations), cycle.number('dwell_s', 0.3, DWELL_S)
+
+
+def _repetition(reader: Reader, kind: str) -> tuple[float, int]:
+    """Of the cycles of a thermal session: time from start to start [s], and how many."""
+    cycle = Reader(f'{reader.where}: cycle', reader.data.get('cycle', {}))
+    if kind != THERMAL:
+        for key in PACE:
+            if key in cycle.data and cycle.data.get('kind') != THERMAL:
+                raise UserError(f'{cycle.where}: {key}: expected with kind: {THERMAL} only')
+        return 0.0, 1
+    every = cycle.number('every_min', 15.0, _EVERY_MIN)
+    cycle.required('hours')
+    minutes = 60.0 * cycle.number('hours', 0.0, _HOURS)
+    # A whole number of intervals may be a little less in floating point.
+    count = int(minutes / every + 1e-9) + 1
+    if not 2 <= count <= _MOST_CYCLES:
+        raise UserError(
+            f'{cycle.where}: {minutes / 60.0:g} h with a cycle every {every:g} min are {count} '
+            f'cycles; expected 2 to {_MOST_CYCLES}'
+        )
+    return 60.0 * every, count
 
 
 def _stations(cycle: Reader, key: str, axis: Axis) -> list[float]:

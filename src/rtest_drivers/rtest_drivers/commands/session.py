@@ -116,10 +116,7 @@ def measure(
 
     # Mistakes in the files are told before anything is started.
     config = load_session(settings.config)
-    settings = replace(
-        settings, sphere_radius=config.sphere_radius, nest=config.nest.name.lower(),
-        devices=config.devices,
-    )
+    settings = settings.of(config)
     simulated = settings.simulate is not None
     if simulated:
         _check_truth(settings.simulate, config.plans)
@@ -145,12 +142,15 @@ def measure(
 def evaluate(settings: GraphSettings, complete: bool) -> Path:
     """Identify what a session has recorded, also where it is incomplete.
 
-    Returns the path of identification.json. Raises NodeFailed where something is missing.
+    Returns the path of identification.json, or of thermal.json after a thermal session. Raises
+    NodeFailed where something is missing.
     """
     from rtest_drivers.commands.identify import identify
+    from rtest_drivers.commands.thermal import evaluate as thermal
 
     try:
-        result = identify(settings.folder, quiet=True)
+        evaluation = thermal if settings.thermal else identify
+        result = evaluation(settings.folder, quiet=True)
     except UserError as error:
         raise NodeFailed(f'{error}\n  recorded: {shown(settings.recording)}') from None
     if not complete:
@@ -162,7 +162,8 @@ def evaluate(settings: GraphSettings, complete: bool) -> Path:
 
 
 def _again(settings: GraphSettings) -> str:
-    return f'rtest identify {shlex.quote(shown(settings.folder))}'
+    command = 'thermal' if settings.thermal else 'identify'
+    return f'rtest {command} {shlex.quote(shown(settings.folder))}'
 
 
 def _check_truth(truth: Path, plans: Sequence[CyclePlan]) -> None:

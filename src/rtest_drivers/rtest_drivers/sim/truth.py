@@ -21,6 +21,7 @@ from rtest_drivers.sim.gauges import GaugeData, LaserData
 from rtest_drivers.sim.laser import SENSORS
 from rtest_drivers.sim.model import load_motions
 from rtest_drivers.sim.motion import Drives
+from rtest_drivers.sim.warming import Warming, parse_warming
 from rtest_estimation.errors import UserError
 from rtest_identification.machine import Machine, load_machine
 
@@ -44,6 +45,9 @@ class Truth:
 
     runout : (2,) sphere off the spindle axis at S = 0, along X and Y of the tool [m]
     remount : time a change of the set-up takes [s]
+    warming : None for a machine that stays as it is
+    thin : while it waits long for the next cycle gauges and encoders are read so often only, and
+        time may pass as fast as it can [ns]; 0 for always as usual
     """
 
     machine: Machine
@@ -55,6 +59,8 @@ class Truth:
     remount: float
     seed: int
     faults: tuple[Fault, ...] = ()
+    warming: Warming | None = None
+    thin: int = 0
 
 
 def load_truth(path: Path | str) -> Truth:
@@ -83,6 +89,8 @@ def load_truth(path: Path | str) -> Truth:
         remount=fields.number('remount_s', 1.0, 0.0),
         seed=fields.integer('seed'),
         faults=parse_faults(fields, len(gauges.tilt)),
+        warming=parse_warming(fields, machine),
+        thin=round(1e9 * fields.number('waiting_read_every_s', 0.0, 0.0)),
     )
     fields.done()
     return truth
