@@ -70,10 +70,9 @@ def test_answers() -> None:
     # The answer to another request.
     with pytest.raises(ReplyError, match='answered by'):
         answer('get estop', 'MACHINE ON')
-    values = positions('get joint_pos', POSITION.decode().strip())
+    values = positions(answer('get joint_pos', POSITION.decode().strip()))
     assert values == pytest.approx([4.968391, -10.125581, -60.603529, 30.0, 40.0, 0.0], abs=0)
-    now = state(['ESTOP OFF', 'MACHINE ON', 'JOINT_HOMED YES YES NO', 'PROGRAM_STATUS PAUSED',
-                 'PROGRAM_LINE 12'])
+    now = state(['OFF', 'ON', 'YES YES NO', 'PAUSED', '12'])
     assert (now.estop, now.machine_on, now.program, now.line) == (False, True, 'PAUSED', '12')
     assert now.homed == (True, True, False)
 
@@ -81,7 +80,7 @@ def test_answers() -> None:
 @pytest.mark.parametrize('words', ['', 'nan 1.0', '1.0 inf', '1.0 2', '0x1 1.0', '1.0 -', '1e3'])
 def test_bad_numbers_are_no_numbers(words: str) -> None:
     with pytest.raises(ReplyError):
-        positions('get joint_pos', f'JOINT_POS {words}')
+        positions(words)
 
 
 def test_damaged_replies_never_become_positions() -> None:
@@ -99,7 +98,7 @@ def test_damaged_replies_never_become_positions() -> None:
                 bad.insert(at, chr(rng.randrange(32, 256)))
         said = ''.join(bad)
         try:
-            values = positions('get joint_pos', said)
+            values = positions(answer('get joint_pos', said))
         except ReplyError:
             continue
         assert np.isfinite(values).all()
@@ -251,6 +250,33 @@ def test_control_that_another_client_takes_is_not_taken_back(
     assert len(feedback) > 100 and time.time_ns() - feedback[-1].stamp < 50e6
     assert sum(request == 'set enable EMCTOO' for request in server.requests) == 2
     other.close()
+    backend.close()
+
+
+def test_requests_mixed_with_those_of_another_client_are_made_again(
+    tmp_path: Path, server: LinuxCncServer
+) -> None:
+    path = device(tmp_path, server, 'enable_password: EMCTOO')
+    server.mixed = 1
+    backend, control = LinuxCnc(path), Control(load_linuxcnc(path))
+    backend.open()
+    for _ in range(5):
+        server.mixed = 2
+        assert follow(backend, 0.8)
+    # The watchdog's control is still its own.
+    assert backend.told()['watchdog'] == 'on'
+    control.open()
+    server.mixed = 3
+    control.pause()
+    # Taken by the driver when it connected again.
+    backend.close()
+    backend.open()
+    control.resume()
+    server.mixed = 100
+    with pytest.raises(ConnectionError):
+        control.pause()
+    server.mixed = 0
+    control.close()
     backend.close()
 
 

@@ -32,7 +32,7 @@ from rtest_drivers.cnc.clock import Recent
 from rtest_drivers.cnc.device_file import load
 from rtest_drivers.cnc.linuxcnc_line import Line
 from rtest_drivers.cnc.linuxcnc_protocol import (
-    STATE_REQUESTS,
+    STATE_WORDS,
     UNIT_WORDS,
     ReplyError,
     State,
@@ -43,7 +43,7 @@ from rtest_drivers.cnc.linuxcnc_watchdog import Watchdog
 from rtest_estimation.errors import UserError
 from rtest_estimation.records import Feedback
 
-_POSITIONS = 'get joint_pos'
+_POSITIONS = 'joint_pos'
 _STATE_S = 0.25
 # A reply that took longer does not say well enough when the axes were there [ns].
 _LATE_NS = 50_000_000
@@ -208,12 +208,12 @@ class LinuxCnc:
 
     def _poll(self, line: Line) -> list[Feedback]:
         sent = self._clock.now()
-        reply = line.ask(_POSITIONS)
+        told = line.get(_POSITIONS)
         came = self._clock.now()
-        values = positions(_POSITIONS, reply)
+        values = positions(told)
         if len(values) != self._count:
             raise ReplyError(f'{line.where} told {len(values)} joints instead of {self._count}')
-        if (said := (reply, self._state and self._state.line)) != self._said:
+        if (said := (told, self._state and self._state.line)) != self._said:
             self._said, self._changed = said, time.monotonic()
         if came - sent > _LATE_NS:
             self._late = time.monotonic()
@@ -225,11 +225,11 @@ class LinuxCnc:
     def _look(self, line: Line) -> None:
         """At the state of the controller."""
         self._looked = time.monotonic()
-        self._state = state([line.ask(request) for request in STATE_REQUESTS])
+        self._state = state([line.get(word) for word in STATE_WORDS])
 
     def _check_axes(self, line: Line) -> None:
         """Hold the device file to what the controller says of its joints."""
-        self._count = count = len(positions(_POSITIONS, line.ask(_POSITIONS)))
+        self._count = count = len(positions(line.get(_POSITIONS)))
         units = line.get('joint_units').split()
         for axis in self._file.axes:
             if axis.source >= count:

@@ -10,7 +10,7 @@ import numpy as np
 
 from rtest_drivers.cnc.linuxcnc import LinuxCnc, LinuxCncFile
 from rtest_drivers.cnc.linuxcnc_line import Line
-from rtest_drivers.cnc.linuxcnc_protocol import STATE_REQUESTS, Refused, State, state
+from rtest_drivers.cnc.linuxcnc_protocol import STATE_WORDS, Refused, State, state
 from rtest_drivers.cnc.sense import Move
 from rtest_estimation.errors import UserError
 
@@ -22,7 +22,9 @@ _STILL_S = 0.3
 
 
 class Control:
-    """Takes control from whatever other client of linuxcncrsh has it.
+    """Takes control from whatever other client of linuxcncrsh has it, and once more if it must.
+
+    The driver's watchdog takes control when the driver connects again, without knowing of others.
 
     An acknowledged command is accepted, not done: what is wrong with it comes later, by `errors`.
     """
@@ -55,12 +57,12 @@ class Control:
     def state(self) -> State:
         """What the controller says of itself."""
         line = self._open_line()
-        return state([line.ask(request) for request in STATE_REQUESTS])
+        return state([line.get(word) for word in STATE_WORDS])
 
     def errors(self) -> list[str]:
         """Error messages since the last call; they are then no longer on the operator's screen."""
         line = self._open_line()
-        told = [line.ask('get error').partition(' ')[2] for _ in range(_MESSAGES)]
+        told = [line.get('error') for _ in range(_MESSAGES)]
         return [text for text in told if text != 'OK']
 
     def machine_on(self) -> None:
@@ -120,7 +122,13 @@ class Control:
     def _set(self, command: str) -> None:
         line = self._open_line()
         try:
-            line.set(f'set {command}')
+            try:
+                line.set(f'set {command}')
+            except Refused:
+                if command.startswith('enable') or line.get('enable') == 'ON':
+                    raise
+                line.set(f'set enable {self._file.enable_password}')
+                line.set(f'set {command}')
         except Refused:
             if command.startswith('enable'):
                 why = 'set enable_password of the device file to what --enablepw says'

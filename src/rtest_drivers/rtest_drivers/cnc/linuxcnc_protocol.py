@@ -22,7 +22,11 @@ class ReplyError(ConnectionError):
     """A reply that is no answer to what was asked."""
 
 
-class Refused(ReplyError):
+class Unanswered(ReplyError):
+    """A whole reply, but not to what was asked."""
+
+
+class Refused(Unanswered):
     """The server says NAK."""
 
 
@@ -43,22 +47,22 @@ def take_line(buffer: bytearray) -> str | None:
 def answer(request: str, reply: str) -> str:
     """What a reply to `get WORD` or `set WORD ...` says after the word.
 
-    Raises Refused where it is NAK, ReplyError where it answers something else.
+    Raises Refused where it is NAK, Unanswered where it answers something else.
     """
     verb, word = request.upper().split()[:2]
     start = f'{verb} {word} ' if verb == 'SET' else f'{word} '
     if reply in (f'{verb} {word} NAK', f'{verb} NAK'):
         raise Refused(f'{request!r} was refused')
     if not reply.startswith(start):
-        raise ReplyError(f'{request!r} was answered by {reply[:60]!r}')
+        raise Unanswered(f'{request!r} was answered by {reply[:60]!r}')
     return reply[len(start) :]
 
 
-def positions(request: str, reply: str) -> np.ndarray:
+def positions(said: str) -> np.ndarray:
     """(joints,) positions; raises ReplyError where one of them is no number."""
-    words = answer(request, reply).split()
+    words = said.split()
     if not words or not all(map(_NUMBER.fullmatch, words)):
-        raise ReplyError(f'{request!r} was answered by {reply[:60]!r}')
+        raise ReplyError(f'positions were told as {said[:60]!r}')
     return np.array(words, dtype=float)
 
 
@@ -76,15 +80,13 @@ class State:
     line: str
 
 
-# Asked for one after the other.
-STATE_REQUESTS = (
-    'get estop', 'get machine', 'get joint_homed', 'get program_status', 'get program_line',
-)
+# Words to `get`, one after the other.
+STATE_WORDS = ('estop', 'machine', 'joint_homed', 'program_status', 'program_line')
 
 
-def state(replies: list[str]) -> State:
-    """The replies to `STATE_REQUESTS`."""
-    estop, machine, homed, program, line = map(answer, STATE_REQUESTS, replies)
+def state(said: list[str]) -> State:
+    """What was said to `STATE_WORDS`."""
+    estop, machine, homed, program, line = said
     return State(
         estop == 'ON', machine == 'ON', tuple(word == 'YES' for word in homed.split()), program,
         line,

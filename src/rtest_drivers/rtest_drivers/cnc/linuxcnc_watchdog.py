@@ -19,7 +19,7 @@ from collections.abc import Callable
 
 from rtest_drivers.clock import HostClock
 from rtest_drivers.cnc.linuxcnc_line import Line
-from rtest_drivers.cnc.linuxcnc_protocol import Refused, answer
+from rtest_drivers.cnc.linuxcnc_protocol import Refused, Unanswered, answer
 
 _PERIOD_S = 0.25
 # An answer takes 0.1 s, and a task cycle more.
@@ -87,8 +87,9 @@ class Watchdog:
         elif (reply := self._line.reply(0.0)) is not None:
             try:
                 answer(self._request, reply)
-            except Refused:
-                self._lost_control = True
+            except Unanswered:
+                # Another client has control, or the words were mixed with those of one.
+                self._lost_control = self._line.get('enable') != 'ON'
             self._alive, self._asked = self._asked, None
         elif waited > _HANGS_S:
             # A command from a screen at the same moment takes the answer away: ask once more.

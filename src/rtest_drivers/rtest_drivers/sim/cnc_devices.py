@@ -28,6 +28,7 @@ class LinuxCncServer:
     position : of joints 0 to 5 [mm] or [deg]
     dead : the task process: positions stay as they are, sets hang
     late : time before every answer [s]; half : answers without their end
+    mixed : how many requests are still refused, as where two came at the same moment
     """
 
     def __init__(
@@ -39,6 +40,7 @@ class LinuxCncServer:
         self.estop, self.machine_on, self.homed = False, True, True
         self.program, self.line = 'IDLE', 0
         self.dead, self.half, self.late = False, False, 0.0
+        self.mixed = 0
         self.in_control: socket.socket | None = None
         self.requests: deque[str] = deque(maxlen=1000)
         self._clients: set[socket.socket] = set()
@@ -80,7 +82,11 @@ class LinuxCncServer:
                 request = raw.decode().strip()
                 self.requests.append(request)
                 answer = f'{request}\n' if session['echo'] and session['linked'] else ''
-                answer += self._answer(client, request.split(), session)
+                if self.mixed > 0:
+                    self.mixed -= 1
+                    answer += f'{request.split()[0].upper()} NAK\r\n'
+                else:
+                    answer += self._answer(client, request.split(), session)
                 if self.late:
                     time.sleep(self.late)
                 client.sendall(answer[: len(answer) // 2 if self.half else None].encode())
@@ -94,6 +100,8 @@ class LinuxCncServer:
             return f'HELLO {said}\r\n'
         if verb == 'get':
             value = self._value(client, name)
+            if name == 'echo':
+                value = 'ON' if session['echo'] else 'OFF'
             if value is None:
                 return f'GET {name.upper()} NAK\r\n\r\n'
             return f'{name.upper()} {value}\r\n'
