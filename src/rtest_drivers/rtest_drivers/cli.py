@@ -12,6 +12,7 @@ from typing import NoReturn
 from rtest_drivers.commands import (
     correct,
     demo,
+    dynamic,
     frustum,
     gap,
     identify,
@@ -24,7 +25,7 @@ from rtest_drivers.graph import ONE_THREAD
 from rtest_drivers.runner import NodeFailed, Stopped
 from rtest_estimation.errors import UserError
 
-COMMANDS = (session, demo, plan, identify, gap, thermal, frustum, correct, info)
+COMMANDS = (session, demo, plan, identify, gap, thermal, dynamic, frustum, correct, info)
 EXIT_FAILED, EXIT_USER, EXIT_INTERRUPTED, EXIT_PIPE = 1, 2, 130, 141
 
 
