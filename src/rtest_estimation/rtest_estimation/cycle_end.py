@@ -17,7 +17,8 @@ ARRIVAL = 0.5
 class CycleEnd:
     """Finds when a cycle is over: its last pose was stood at for the dwell, or the next began.
 
-    The machine may stay at the last pose or go away after the dwell.
+    The machine may stay at the last pose or go away after the dwell. Of a dynamic cycle the last
+    pose counts that comes after all others.
     """
 
     def __init__(self, rules: DwellRules) -> None:
@@ -66,10 +67,30 @@ class CycleEnd:
 
     def _done(self, plan: CyclePlan, stamps: np.ndarray, positions: np.ndarray) -> bool:
         """Whether the last pose was reached, and not as the first of all."""
+        if plan.kind is Kind.DYNAMIC:
+            return len(arrivals(plan, positions, self.rules)) == len(plan.commands)
         dwells, missing = find_dwells(plan, stamps, positions, self.rules)
         reached = {d.index for d in dwells}
-        done = len(plan.commands) - 1 in reached and plan.kind is not Kind.DYNAMIC
-        return done and (len(reached) > 1 or not missing)
+        return len(plan.commands) - 1 in reached and (len(reached) > 1 or not missing)
+
+
+def arrivals(plan: CyclePlan, positions: np.ndarray, rules: DwellRules) -> list[int]:
+    """Rows of `positions` at which the axes first came to the poses of a plan, in its order.
+
+    Ends before the first pose that they did not come to.
+
+    positions : (n, axes) in the order of ``plan.axes``; NaN where the feedback has no such axis
+    """
+    near = np.array([rules.near[axis in ROTARY_LETTERS] for axis in plan.axes])
+    found: list[int] = []
+    for row in plan.commands:
+        first = found[-1] if found else 0
+        off = np.abs(positions[first:] - row)
+        there = ((off <= near) | np.isnan(off)).all(axis=1)
+        if not there.any():
+            break
+        found.append(first + int(np.argmax(there)))
+    return found
 
 
 def _there(axes: tuple[str, ...], sample: Feedback, last: np.ndarray, near: list[float]) -> bool:

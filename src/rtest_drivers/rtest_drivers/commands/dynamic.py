@@ -10,7 +10,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from rtest_drivers.commands.identify import default_output, recording_name
+from rtest_drivers.commands.identify import default_output, folders, recording_name
 
 HELP = 'dynamic errors while a rotary axis turns'
 OUTPUT = 'dynamic'
@@ -28,34 +28,40 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Evaluate every recording."""
-    several = len(arguments.bags) > 1
-    for bag in arguments.bags:
-        out = arguments.out / recording_name(bag) if arguments.out and several else arguments.out
-        _one(bag, arguments, out or default_output(bag, OUTPUT))
+    for bag, out in folders(arguments.bags, arguments.out, OUTPUT):
+        evaluate(bag, out, arguments.machine, not arguments.no_report)
     return 0
 
 
-def _one(bag: Path, arguments: argparse.Namespace, out: Path) -> None:
+def evaluate(
+    bag: Path, out: Path | None = None, machine: Path | None = None, report: bool = True
+) -> Path:
+    """Evaluate one recording, with progress and a last line that says what was found.
+
+    machine : another machine file than the recorded one
+
+    Returns the path of dynamic.json.
+    """
     from rtest_drivers.commands.session import shown
     from rtest_drivers.folders import check_folder, writing
     from rtest_identification.dynamic import output
     from rtest_identification.dynamic.offline import dynamic_recording
     from rtest_identification.dynamic.report import write_report
 
-    check_folder(out)
-    session = dynamic_recording(
-        bag, arguments.machine, lambda line: print(f'  {line}', flush=True)
-    )
+    folder = out or default_output(bag, OUTPUT)
+    check_folder(folder)
+    session = dynamic_recording(bag, machine, lambda line: print(f'  {line}', flush=True))
     for warning in session.warnings:
         print(f'  warning: {warning}')
-    with writing(out):
-        path = output.write(session, out)
-        if not arguments.no_report:
-            write_report(session, out)
     for result in session.results:
         for warning in result.warnings:
             print(f'  warning: {result.setup}: {warning}')
         for line in output.lines(result):
             print(f'  {line}')
+    with writing(folder):
+        path = output.write(session, folder)
+        if report:
+            write_report(session, folder)
     found = '; '.join(output.summary(result) for result in session.results)
     print(f'{recording_name(bag)}: {found} -> {shown(path.absolute())}', flush=True)
+    return path

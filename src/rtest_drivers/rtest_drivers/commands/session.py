@@ -144,12 +144,20 @@ def measure(
 def evaluate(settings: GraphSettings, complete: bool) -> Path:
     """Identify what a session has recorded, also where it is incomplete.
 
-    Returns the path of identification.json. Raises NodeFailed where something is missing.
+    Returns the path of identification.json, or of dynamic.json where there is no static cycle.
+    Raises NodeFailed where something is missing.
     """
+    from rtest_drivers.commands import dynamic
     from rtest_drivers.commands.identify import identify
+    from rtest_estimation.records import Kind
+    from rtest_identification.session_file import load_session
 
+    kinds = {plan.kind for plan in load_session(settings.config).plans}
     try:
-        result = identify(settings.folder, quiet=True)
+        if Kind.DYNAMIC in kinds:
+            result = dynamic.evaluate(settings.folder)
+        if Kind.STATIC in kinds:
+            result = identify(settings.folder, quiet=True)
     except UserError as error:
         raise NodeFailed(f'{error}\n  recorded: {shown(settings.recording)}') from None
     if not complete:
@@ -161,7 +169,10 @@ def evaluate(settings: GraphSettings, complete: bool) -> Path:
 
 
 def _again(settings: GraphSettings) -> str:
-    return f'rtest identify {shlex.quote(shown(settings.folder))}'
+    from rtest_identification.session_file import DYNAMIC, load_session
+
+    static = load_session(settings.config).kind != DYNAMIC
+    return f'rtest {"identify" if static else "dynamic"} {shlex.quote(shown(settings.folder))}'
 
 
 def _check_truth(truth: Path, plans: Sequence[CyclePlan]) -> None:

@@ -22,6 +22,9 @@ from rtest_estimation.errors import UserError
 from rtest_estimation.records import CyclePlan, Feedback, GaugeBlock, Kind, Status
 
 _READINGS, _OUTLIERS, _ENCODERS = 1, 2, 3
+# A dynamic cycle rests so long wherever it turns round; half the time over which speeds are
+# differences [ns].
+_REST, _HALF_SPAN = 1_000_000_000, 1_000_000
 
 
 @dataclass(frozen=True)
@@ -126,7 +129,8 @@ class Cell:
             for fault in self.truth.faults
             if fault.kind == 'pose_skipped' and fault.cycle == plan.cycle
         }
-        dwell = round(plan.dwell * 1e9)
+        dynamic = plan.kind is Kind.DYNAMIC
+        dwell = _REST if dynamic else round(plan.dwell * 1e9)
         columns = [self.axes.index(name) for name in plan.axes]
         poses: dict[int, tuple[int, int]] = {}
         clock = start
@@ -137,9 +141,10 @@ class Cell:
             if SPINDLE not in plan.axes:
                 target[-1] = 0.0
             target[columns] = row
-            offset = self.truth.gauges.dwell_noise * self._named(
-                f'{plan.cycle}/{pose}'
-            ).standard_normal(3)
+            # Nothing settles anew where a dynamic cycle turns round.
+            name = plan.cycle if dynamic else f'{plan.cycle}/{pose}'
+            offset = self.truth.gauges.dwell_noise * self._named(name).standard_normal(3)
+            speed = plan.feed if dynamic and poses else 0.0
             if plan.setup != self._setup:
                 self._setup = plan.setup
                 leg = self._timeline.append(clock, target, -1, offset)
@@ -148,7 +153,7 @@ class Cell:
                 self._timeline.rest(clock, len(self._nests) - 1, offset)
             else:
                 clock = self._timeline.append(
-                    clock, target, len(self._nests) - 1, offset
+                    clock, target, len(self._nests) - 1, offset, speed
                 ).arrival
             poses[pose] = (clock, clock + dwell)
             clock += dwell
@@ -193,7 +198,7 @@ class Cell:
                 if not lost[part].any():
                     blocks.append(
                         GaugeBlock(
-                            int(times[first]),
+                            int(times[first]) + round(data.late * 1e9),
                             self._sequence,
                             data.period * 1e-9 if data.batch > 1 else 0.0,
                             values[part],
@@ -218,6 +223,9 @@ class Cell:
         mounted = state.nest >= 0
         if mounted.any():
             sphere = self._sphere(state.positions[mounted]) + state.offset[mounted]
+            if data.friction:
+                velocity = self._velocity(times[mounted], state.positions[mounted])
+                sphere += gauges.friction(data, velocity)
             readings = np.empty((len(sphere), shape[1]))
             for index in np.unique(state.nest[mounted]):
                 rows = state.nest[mounted] == index
@@ -231,6 +239,17 @@ class Cell:
         x, y = self.truth.runout
         runout = np.column_stack([x * cosine - y * sine, x * sine + y * cosine, 0.0 * sine])
         return sphere_in_table(self.truth.machine, positions[:, :-1], self.truth.errors, runout)
+
+    def _velocity(self, times: np.ndarray, positions: np.ndarray) -> np.ndarray:
+        """(n, 3) how the linear axes carry the sphere, frame ``table`` [m/s]."""
+        machine = self.truth.machine
+        linear = [machine.letters.index(name) for name in machine.linear]
+        ends = []
+        for step in (-_HALF_SPAN, _HALF_SPAN):
+            moved = positions[:, :-1].copy()
+            moved[:, linear] = self._timeline.at(times + step).positions[:, linear]
+            ends.append(sphere_in_table(machine, moved))
+        return (ends[1] - ends[0]) / (2e-9 * _HALF_SPAN)
 
     def _spoil(
         self, times: np.ndarray, values: np.ndarray, status: np.ndarray
@@ -284,9 +303,15 @@ def check(plan: CyclePlan, truth: Truth) -> None:
     Raises UserError naming cycle, axis, pose and what is expected.
     """
     where = f'plan {plan.cycle!r}'
-    if plan.kind is Kind.DYNAMIC:
-        raise UserError(f'{where}: the simulated cell does static cycles, not dynamic ones')
     axes = truth.machine.axes
+    if plan.kind is Kind.DYNAMIC:
+        turned = [k for k, name in enumerate(plan.axes) if name in axes and axes[name].rotary]
+        steps = np.abs(np.diff(plan.commands[:, turned], axis=0))
+        if not plan.feed > 0.0 or not len(steps) or steps.max(axis=1).min() < 1e-9:
+            raise UserError(
+                f'{where}: a dynamic cycle turns a rotary axis between all of its poses, with a '
+                'feed'
+            )
     for column, name in enumerate(plan.axes):
         if name == SPINDLE:
             continue

@@ -8,6 +8,9 @@ import numpy as np
 
 from rtest_estimation.records import Status
 
+# Slower than this the sphere stands still [m/s].
+_CREEPING = 1e-4
+
 
 @dataclass(frozen=True)
 class GaugeData:
@@ -21,6 +24,9 @@ class GaugeData:
     dwell_noise : of the sphere, once per dwell in each direction [m]
     lower, upper : range [m]; period : between readings [ns]; batch : readings in a message
     outliers, outlier : share of readings, standard deviation [m]
+    late : by how much the stamps are later than the encoders' [s]
+    friction : how far touching probes trail the motion at `friction_speed` [m], [m/s], and with
+        which power of the speed that grows
     """
 
     azimuth: np.ndarray
@@ -35,6 +41,10 @@ class GaugeData:
     batch: int
     outliers: float = 0.0
     outlier: float = 0.0
+    late: float = 0.0
+    friction: float = 0.0
+    friction_speed: float = 0.01
+    friction_power: float = 0.0
 
     @property
     def directions(self) -> np.ndarray:
@@ -66,6 +76,17 @@ def mount(data: GaugeData, sphere: np.ndarray, rng: np.random.Generator) -> Nest
     directions = data.directions + data.direction_error * rng.standard_normal((len(data.tilt), 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     return Nest(directions, sphere + data.position_error * rng.standard_normal(3))
+
+
+def friction(data: GaugeData, velocity: np.ndarray) -> np.ndarray:
+    """(n, 3) by how much the probes show the sphere behind its motion [m].
+
+    velocity : (n, 3) of the sphere, frame ``table`` without the table's own turning [m/s]
+    """
+    speed = np.linalg.norm(velocity, axis=1)
+    size = data.friction * (speed / data.friction_speed) ** data.friction_power
+    # A sphere that hardly moves has no side on which to hang back.
+    return -velocity * (size / np.maximum(speed, _CREEPING))[:, None]
 
 
 def limit(data: GaugeData, readings: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -7,6 +7,7 @@ from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
+from scipy.interpolate import Akima1DInterpolator
 
 from rtest_estimation.errors import UserError
 from rtest_identification.dynamic.motion import Motion, Pass, Readings
@@ -198,8 +199,11 @@ def _blocks(
         total = np.add.reduceat(values, first, axis=0)
         return total / count.reshape(-1, *[1] * (values.ndim - 1))
 
+    # Smooth between samples: encoders may be slow beside what happens at a start.
+    smooth = Akima1DInterpolator(track.time, track.servo)
+
     def servo(at: np.ndarray) -> np.ndarray:
-        return np.stack([np.interp(at, track.time, s) for s in track.servo.T], axis=1)
+        return smooth(np.clip(at, track.time[0], track.time[-1]))
 
     def omega(at: np.ndarray) -> np.ndarray:
         return np.interp(at, track.time, track.omega)

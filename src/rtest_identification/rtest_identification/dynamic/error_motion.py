@@ -8,7 +8,7 @@ import numpy as np
 
 from rtest_identification.dynamic.blocks import STEADY_ANGLE, Scene
 from rtest_identification.dynamic.effects import lag_at
-from rtest_identification.dynamic.rows import Rows, geometric
+from rtest_identification.dynamic.rows import Rows, cycle_shifts, geometric
 from rtest_identification.gap.size import visible
 
 # Angles at which turns are compared.
@@ -25,7 +25,7 @@ _ENOUGH = np.radians(300.0)
 class Parts:
     """Displacement of every block, split; radial, tangential, axial, (n, 3) each [m].
 
-    measured : as the gauges show it, without the zero, the drift and the centre offset
+    measured : as the gauges show it, without the zeros, the drift and the centre offset
     servo : what the encoders show of it, less its mean zero
     geometric : what depends on the angle alone
     dynamic : the rest; explained : what the named effects are of it
@@ -105,9 +105,10 @@ def split(gauges: Rows, encoders: Rows, effects: int = 0) -> Parts:
     """
     scene, rows = gauges.scene, gauges
     fit, zero_servo = rows.fit(), encoders.fit()[:3]
-    # Columns: lateness, geometric with the zero first, drift, starts and stops, effects.
-    columns = geometric(scene).shape[2]
-    shape, drift = slice(4, 1 + columns), slice(1 + columns, 4 + columns)
+    # Columns: lateness, geometric with the zero first, drift and zeros of cycles, starts and
+    # stops, effects.
+    columns, zeros = geometric(scene).shape[2], cycle_shifts(scene).shape[2]
+    shape, drift = slice(4, 1 + columns), slice(1 + columns, 4 + columns + zeros)
     named = slice(len(fit) - effects, len(fit))
     free = slice(drift.stop, named.start)
     zero = fit[1:4]

@@ -11,6 +11,8 @@ import numpy as np
 from rtest_estimation import nest as nests
 from rtest_estimation.bagfile import read_bag
 from rtest_estimation.buffers import FeedbackBuffer, GaugeBuffer
+from rtest_estimation.cycle_end import arrivals
+from rtest_estimation.dwell import DwellRules
 from rtest_estimation.errors import UserError
 from rtest_estimation.laser.solver import CentreSolver, CentreStatus
 from rtest_estimation.pipeline import Finished
@@ -89,6 +91,9 @@ def dynamic_session(
                 f'{plan.cycle}: the plan has axes {" ".join(plan.axes)}, the machine file '
                 f'{machine.name!r} also has {" ".join(absent)}; give the right machine file'
             )
+        # How the axes came to the first pose is no part of the measurement.
+        began = arrivals(plan, positions, DwellRules())[:1]
+        stamps, positions = stamps[sum(began) :], positions[sum(began) :]
         order = [plan.axes.index(name) for name in machine.letters]
         times, displacement, status = gauges.window(plan.stamp, cycle.stamp)
         if not len(stamps) or not len(times):

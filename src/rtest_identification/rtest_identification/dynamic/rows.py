@@ -2,8 +2,8 @@
 
 The gauges' rows are the measured sphere centre less what the encoders say; free beside the
 effects are what depends on the angle alone (geometric, independent of speed and direction), a slow
-drift, and the time between the clocks of gauges and CNC. The encoders' rows are the circle
-deviation of the feedback itself.
+drift, the zero of each cycle, and the time between the clocks of gauges and CNC. The encoders'
+rows are the circle deviation of the feedback itself.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from functools import cached_property
 import numpy as np
 
 from rtest_identification.dynamic.blocks import Scene
-from rtest_identification.dynamic.effects import speed_in_transients
+from rtest_identification.dynamic.effects import TANGENTIAL, speed_in_transients
 from rtest_identification.dynamic.noise import Noise, estimate, orthonormal, waves
 from rtest_identification.gap.effects import Effect
-from rtest_identification.least_squares import solve
+from rtest_identification.least_squares import RANK_TOLERANCE
 
 # The geometric part has this many harmonics of a full turn.
 ORDERS = 12
@@ -57,7 +57,9 @@ class Rows:
         """(r,) coefficients of the base model; the smallest where the data leave them open."""
         design = self.white(self.base)
         scale = 1.0 / np.maximum(np.linalg.norm(design, axis=0), 1e-300)
-        return solve(design, self.white(self.value), scale).value
+        # Without the covariance that `least_squares.solve` gives, which takes twice as long.
+        found = np.linalg.lstsq(design * scale, self.white(self.value), rcond=RANK_TOLERANCE)[0]
+        return scale * found
 
     @cached_property
     def basis(self) -> np.ndarray:
@@ -81,7 +83,9 @@ def gauge_rows(
     noise = noise or estimate(scene, value)
     time = scene.time - scene.time.mean()
     drift = _each(time[:, None] / max(np.abs(time).max(), 1e-9))
-    fixed = np.concatenate([geometric(scene), drift, speed_in_transients(scene)], axis=2)
+    fixed = np.concatenate(
+        [geometric(scene), drift, cycle_shifts(scene), speed_in_transients(scene)], axis=2
+    )
     base = np.concatenate([lateness(scene, fixed, noise), fixed], axis=2)
     return _rows(scene, value, base, extra, noise)
 
@@ -122,6 +126,24 @@ def lateness(scene: Scene, fixed: np.ndarray, noise: Noise) -> np.ndarray:
     number = later.shape[2]
     moving = (later - earlier) @ fit[len(fit) - number :] / (2.0 * _DIFFERENCE)
     return -(scene.change + slope + moving)[:, :, None]
+
+
+def cycle_shifts(scene: Scene) -> np.ndarray:
+    """(n, 3, k) columns of the zero of every cycle after the first.
+
+    Tangentially only of cycles that go both ways: in others the zero would be the lag itself.
+    """
+    passes = scene.motion.passes
+    cycle = np.array([one.cycle for one in passes])[scene.number]
+    columns = []
+    for number in np.unique(cycle)[1:]:
+        signs = {one.sign for one in passes if one.cycle == number}
+        for component in range(3):
+            if component != TANGENTIAL or len(signs) > 1:
+                column = np.zeros((len(scene), 3))
+                column[cycle == number, component] = 1.0
+                columns.append(column)
+    return np.stack(columns, axis=2) if columns else np.empty((len(scene), 3, 0))
 
 
 def pass_shifts(scene: Scene) -> np.ndarray:
