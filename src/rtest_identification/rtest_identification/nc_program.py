@@ -27,7 +27,7 @@ from rtest_identification.machine import Machine
 from rtest_identification.moves import ARC_TOLERANCE, Approach, AxisPath, clear_of_nest
 from rtest_identification.nc_controllers import CONTROLLERS
 from rtest_identification.plan_check import duration
-from rtest_identification.plans import SPINDLE
+from rtest_identification.plans import DYNAMIC_REST, SPINDLE
 
 # 0.1 um and 1e-5 deg: the latter moves the sphere by 0.02 um at 100 mm.
 LINEAR_DIGITS, ROTARY_DIGITS = 4, 5
@@ -86,7 +86,9 @@ def nc_program(
             f'{", ".join(machine.linear)}'
         )
     turned = [machine.letters.index(name) for name in machine.rotary]
-    if settings.tcp and np.abs(plan.commands[[0, -1]][:, turned]).max(initial=0.0) > 1e-9:
+    # A full turn from zero the table is where it is at zero.
+    ends = np.sin(0.5 * plan.commands[[0, -1]][:, turned])
+    if settings.tcp and np.abs(ends).max(initial=0.0) > 1e-9:
         raise UserError(f'{plan.cycle}: in TCP mode a cycle must start and end with rotary axes 0')
     writer = _Writer(machine, plan.axes)
     lines = ['%', *([f'O{number:04d}'] if settings.controller == 'iso' else [])]
@@ -143,7 +145,7 @@ def _header(
         f'MACHINE {machine.name}, CONTROLLER {controller.name}, MM AND DEG',
         f'SETUP {plan.setup}: SPHERE CENTRE AT X{x:.3f} Y{y:.3f} Z{z:.3f} OF THE TABLE FRAME'
         + (f', RADIUS {sphere_radius * 1e3:.4f}' if sphere_radius else ''),
-        f'{len(plan.commands)} POSES, DWELL {plan.dwell:g} S, ABOUT {minutes:.0f} MIN'
+        f'{len(plan.commands)} POSES, DWELL {plan.dwell or DYNAMIC_REST:g} S, ABOUT {minutes:.0f} MIN'
         + (' WITHOUT THE STOPS' if settings.pause else ''),
     ]
     said += [_axis(machine, name) for name in machine.letters]
@@ -241,7 +243,7 @@ def _poses(
                 lines.append(f'M19 R{round(angle, 3) % 360.0:.3f}')
             # No message: LinuxCNC keeps some twenty for a screen to fetch, and where there is none
             # each further one holds the program, and what it tells of itself, for 5 s.
-            lines += [f'(POSE {pose})', controller.dwell(plan.dwell)]
+            lines += [f'(POSE {pose})', controller.dwell(plan.dwell or DYNAMIC_REST)]
             if settings.pause:
                 lines.append('M0')
     return lines

@@ -17,19 +17,22 @@ from rtest_identification.foresight import NOISE, Expected, ExpectedMap, Foresig
 from rtest_identification.moves import AxisPath, synchronous_path
 from rtest_identification.nc_program import NcSettings, nc_program
 from rtest_identification.plan_check import NOT_CHECKED, PlanCheck, check_plan
-from rtest_identification.session_file import SessionConfig
+from rtest_identification.session_file import DYNAMIC, SessionConfig
 
 COVERAGE_FACTOR = 2.0
 
 
 @dataclass(frozen=True)
 class CheckedPlan:
-    """A session's cycles with their moves, checked, and what they will determine."""
+    """A session's cycles with their moves, checked, and what they will determine.
+
+    foresight : of the static cycles; None where there is none
+    """
 
     config: SessionConfig
     paths: tuple[AxisPath, ...]
     checks: tuple[PlanCheck, ...]
-    foresight: Foresight
+    foresight: Foresight | None
 
     @property
     def duration(self) -> float:
@@ -39,6 +42,9 @@ class CheckedPlan:
     @property
     def warnings(self) -> tuple[str, ...]:
         """What somebody should know before measuring."""
+        checks = tuple(text for check in self.checks for text in check.warnings)
+        if self.foresight is None:
+            return checks
         location = self.foresight.location
         lost = [p.symbol for p, good in zip(location.parameters, location.determined, strict=True)
                 if not good]
@@ -49,7 +55,7 @@ class CheckedPlan:
                     f'map of {one.axis}: these spheres do not tell {", ".join(one.undetermined)} '
                     'from each other at every pose'
                 )
-        return (*found, *(text for check in self.checks for text in check.warnings))
+        return (*found, *checks)
 
     @property
     def unchecked(self) -> str:
@@ -74,7 +80,10 @@ def check_session(
         check_plan(machine, plan, path, config.approach, config.table, config.spindle)
         for plan, path in zip(config.plans, paths, strict=True)
     )
-    return CheckedPlan(config, paths, checks, foresee(machine, config.plans, paths, noise))
+    foresight = None
+    if config.kind != DYNAMIC:
+        foresight = foresee(machine, config.plans, paths, noise)
+    return CheckedPlan(config, paths, checks, foresight)
 
 
 def write_plan(
@@ -108,7 +117,8 @@ def write_plan(
             )
             number += 1
         cycles.append(entry)
-    files['error_motions.csv'] = _error_motions(checked.foresight)
+    if checked.foresight is not None:
+        files['error_motions.csv'] = _error_motions(checked.foresight)
     files['machine.yaml'] = config.machine.text
     files['session.yaml'] = _session(config)
     data = _as_dict(checked, session) | {'cycles': cycles}
@@ -166,10 +176,13 @@ def _error_motions(seen: Foresight) -> str:
 
 def _session(config: SessionConfig) -> str:
     """The session file with the cycle as it was planned, beside its machine file."""
-    cycle = dict(config.data.get('cycle', {})) | {'kind': config.kind}
-    for name, stations in zip(config.machine.rotary, config.stations, strict=True):
-        cycle[f'{name.lower()}_deg'] = [round(v, 9) + 0.0 for v in np.degrees(stations).tolist()]
-    data = config.data | {'machine': 'machine.yaml', 'cycle': cycle}
+    data = config.data | {'machine': 'machine.yaml'}
+    if config.kind != DYNAMIC:
+        cycle = dict(config.data['cycle']) | {'kind': config.kind}
+        for name, stations in zip(config.machine.rotary, config.stations, strict=True):
+            degrees = np.degrees(stations).tolist()
+            cycle[f'{name.lower()}_deg'] = [round(v, 9) + 0.0 for v in degrees]
+        data['cycle'] = cycle
     if config.devices:
         # Their files stay where they are.
         data['devices'] = {
@@ -182,17 +195,23 @@ def _session(config: SessionConfig) -> str:
 
 def _as_dict(checked: CheckedPlan, session: str) -> dict[str, Any]:
     config, seen = checked.config, checked.foresight
-    rotary = [p.axis in config.machine.rotary for p in seen.location.parameters]
-    maps = [m for m in (seen.outer_map, seen.inner_map) if m is not None]
-    return {
+    common = {
         'session': session,
         'machine': config.machine.name,
         'kind': config.kind,
+        'duration': checked.duration,
+        'not_checked': checked.unchecked,
+        'warnings': list(checked.warnings),
+    }
+    if seen is None:
+        return common
+    rotary = [p.axis in config.machine.rotary for p in seen.location.parameters]
+    maps = [m for m in (seen.outer_map, seen.inner_map) if m is not None]
+    return common | {
         'stations': {
             name: values.tolist()
             for name, values in zip(config.machine.rotary, config.stations, strict=True)
         },
-        'duration': checked.duration,
         'noise': seen.noise,
         'coverage_factor': COVERAGE_FACTOR,
         'poses': seen.poses,
@@ -207,8 +226,6 @@ def _as_dict(checked: CheckedPlan, session: str) -> dict[str, Any]:
             }
             for o in seen.outlooks
         ],
-        'not_checked': checked.unchecked,
-        'warnings': list(checked.warnings),
     }
 
 

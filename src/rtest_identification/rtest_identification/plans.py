@@ -23,6 +23,9 @@ UNEVEN_DEG = (0, 50, 60, 80, 110, 145, 160, 200, 240, 270, 315, 335)
 # How far an outermost level is overrun before it is approached from outside: more than any
 # backlash and enough to be a pose of its own, less than what counts as another station [rad].
 OVERRUN = math.radians(0.05)
+# A dynamic cycle rests so long where it turns round: the readings have settled, and the end of the
+# cycle is seen by half of it [s].
+DYNAMIC_REST = 1.0
 
 
 def nest_calibration(

@@ -117,7 +117,6 @@ def _misfit(track: Track, times: np.ndarray, measured: np.ndarray, offset: float
     columns = [angle**power for power in range(_POWERS + 1)]
     columns += [speed, np.where(np.abs(speed) > 0.05, np.sign(speed), 0.0)]
     servo = np.stack([np.interp(at, track.time, s) for s in track.servo.T], axis=1)
-    free = orthonormal(np.stack(columns, axis=1))
-    left = measured - servo
-    left = left - free @ (free.T @ left)
+    free, left = np.stack(columns, axis=1), measured - servo
+    left = left - free @ np.linalg.lstsq(free, left, rcond=1e-6)[0]
     return float((left**2).sum())

@@ -59,7 +59,8 @@ class Lag:
 class TurnMotion:
     """Error motion of one pass over its full turns (ISO 230-7:2015, 3.2).
 
-    angle : (k,) [rad]; turns : (t, k, 3) displacement at it; mean : (k, 3)
+    angle : (k,) [rad]; turns : (t, k, 3) displacement at it, NaN where the last of several turns
+        is not complete; mean : (k, 3)
     covered : part of the turn that was run at the feed; less than one where a pass is shorter
     synchronous : (3,) width of the mean over the turn [m]
     asynchronous : (3,) largest width over the turns at one angle; NaN with a single turn
@@ -170,7 +171,7 @@ def turn_motions(scene: Scene, values: np.ndarray) -> tuple[TurnMotion, ...]:
         travel = (scene.angle[mine] - scene.angle[mine[0]]) * one.sign
         if travel[-1] < _ENOUGH:
             continue
-        turns = max(int((travel[-1] + STEADY_ANGLE) / (2.0 * np.pi)), 1)
+        turns = max(int((travel[-1] - _ENOUGH) / (2.0 * np.pi)) + 1, 1)
         grid = (np.arange(turns * STATIONS) + 0.5) * (2.0 * np.pi / STATIONS)
         # Means over the station, so that every feed is smoothed alike.
         place = np.floor(travel / (2.0 * np.pi / STATIONS)).astype(int)
@@ -178,9 +179,12 @@ def turn_motions(scene: Scene, values: np.ndarray) -> tuple[TurnMotion, ...]:
         means = np.add.reduceat(values[mine], first, axis=0) / share[:, None]
         where = np.add.reduceat(travel, first) / share
         each = np.stack([np.interp(grid, where, column) for column in means.T], axis=1)
+        if turns > 1:
+            each[grid > where[-1] + STEADY_ANGLE] = np.nan
         each = each.reshape(turns, STATIONS, 3)
-        mean = each.mean(axis=0)
-        spread = np.ptp(each, axis=0).max(axis=0) if turns > 1 else np.full(3, np.nan)
+        mean, spread = np.nanmean(each, axis=0), np.full(3, np.nan)
+        if turns > 1:
+            spread = (np.nanmax(each, axis=0) - np.nanmin(each, axis=0)).max(axis=0)
         covered = float(travel[-1] + STEADY_ANGLE) / (2.0 * np.pi)
         angle = scene.angle[mine[0]] + one.sign * grid[:STATIONS]
         waves = np.abs(np.fft.rfft(mean, axis=0))[: ORDERS + 1] * 2.0 / STATIONS

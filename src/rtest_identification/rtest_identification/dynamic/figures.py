@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MultipleLocator
 
-from rtest_identification.dynamic.motion import COMPONENTS, Pass
+from rtest_identification.dynamic.motion import COMPONENTS, Motion, Pass
 from rtest_identification.dynamic.pipeline import DynamicResult
 from rtest_identification.figures.style import COVERAGE, round_down, times
 
@@ -63,8 +63,7 @@ def polar(result: DynamicResult, component: int) -> Figure:
                               linewidth=0.8, label=label if number == chosen[0] else None)
             if chosen:
                 _start(axes, scene.machine_angle[scene.of_pass(chosen[0])], radius)
-            axes.set_title(_title(motion.passes[chosen[0]], motion.radius) if chosen else '',
-                           fontsize=10)
+            axes.set_title(_title(motion.passes[chosen[0]], motion) if chosen else '', fontsize=10)
     limit = 1.04 * max(limit, radius)
     first, second = _plane(result)
     scale = _scale(limit, factor)
@@ -103,7 +102,7 @@ def axial(result: DynamicResult) -> Figure:
             axes.plot(angle, 1e6 * values[mine, 2], color=colour, linewidth=0.8,
                       alpha=1.0 if one.sign > 0 else 0.55,
                       label=f'{label} {"+" if one.sign > 0 else "−"}{motion.axis}')
-        axes.set_title(_title(one, motion.radius).rsplit(',', 1)[0], fontsize=10)
+        axes.set_title(_title(one, motion).rsplit(',', 1)[0], fontsize=10)
     for axes in grid:
         axes.set_ylabel('axial [µm]')
         axes.grid(alpha=0.3)
@@ -230,7 +229,7 @@ def harmonics(result: DynamicResult) -> Figure:
                       label='feedback' if place == 0 else None)
     for component, (axes, word) in enumerate(zip(grid, COMPONENTS, strict=True)):
         axes.set_title(word, fontsize=10)
-        axes.set_xlabel('times a turn (0: mean)')
+        axes.set_xlabel('times a turn (0: size of the mean)')
         axes.set_xticks(orders)
         axes.grid(alpha=0.3, axis='y')
         if component == 0:
@@ -264,9 +263,10 @@ def _minus(text: str) -> str:
     return text.replace('-', '−')
 
 
-def _title(one: Pass, radius: float) -> str:
-    path = 6e4 * one.speed * radius
-    return f'{one.label[:-2]} ({path:,.0f} mm/min), {"+" if one.sign > 0 else "−"}'
+def _title(one: Pass, motion: Motion) -> str:
+    path = 6e4 * one.speed * motion.radius
+    way = '+' if one.sign > 0 else '−'
+    return f'{one.label[:-2]} ({path:,.0f} mm/min), {motion.axis}{way}'
 
 
 def _plane(result: DynamicResult) -> tuple[str, str]:
