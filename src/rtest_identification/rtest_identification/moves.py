@@ -90,7 +90,7 @@ def synchronous_path(
     The rotary axes go straight to their ends and the linear ones so that the sphere goes straight,
     as seen from the table, from one nominal place to the next, which is the same one in a static
     cycle. There are as many pieces as it takes to keep the sphere within `tolerance` [m] of that.
-    Each takes as long as its slowest axis; in a dynamic cycle as its rotary axis takes at the feed.
+    Each takes as long as its slowest axis; in a dynamic cycle, as its rotary axis at the feed.
     """
     speeds, fewest, most = speeds or Speeds(), 1, math.inf
     if plan.kind is Kind.DYNAMIC:

@@ -136,7 +136,7 @@ def _header(
     sphere_radius: float | None,
 ) -> list[str]:
     controller = CONTROLLERS[settings.controller]
-    minutes = duration(plan, path, approach) / 60.0
+    minutes, dwell = duration(plan, path, approach) / 60.0, plan.dwell or DYNAMIC_REST
     x, y, z = np.asarray(plan.sphere) * 1e3
     at_zero = machine.tool * 1e3
     said = [
@@ -145,7 +145,7 @@ def _header(
         f'MACHINE {machine.name}, CONTROLLER {controller.name}, MM AND DEG',
         f'SETUP {plan.setup}: SPHERE CENTRE AT X{x:.3f} Y{y:.3f} Z{z:.3f} OF THE TABLE FRAME'
         + (f', RADIUS {sphere_radius * 1e3:.4f}' if sphere_radius else ''),
-        f'{len(plan.commands)} POSES, DWELL {plan.dwell or DYNAMIC_REST:g} S, ABOUT {minutes:.0f} MIN'
+        f'{len(plan.commands)} POSES, DWELL {dwell:g} S, ABOUT {minutes:.0f} MIN'
         + (' WITHOUT THE STOPS' if settings.pause else ''),
     ]
     said += [_axis(machine, name) for name in machine.letters]

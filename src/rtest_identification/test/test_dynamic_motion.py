@@ -28,7 +28,7 @@ from rtest_identification.dynamic.error_motion import (
     turn_motions,
 )
 from rtest_identification.dynamic.motion import Readings, components, describe
-from rtest_identification.dynamic.rows import encoder_rows, gauge_rows
+from rtest_identification.dynamic.rows import cycle_shifts, encoder_rows, gauge_rows
 from rtest_identification.machine import parse_machine
 
 MACHINE = parse_machine(NMV)
@@ -248,13 +248,13 @@ def test_the_spike_at_the_start_is_seen_by_both():
     assert 0.05 < fast.settled < 0.2
 
 
-@pytest.mark.parametrize('drift', [0.0, 2e-7])
-def test_the_stated_uncertainty_is_the_scatter(drift):
-    """Monte Carlo: time offset and lags of 12 measurements against their stated deviation."""
-    late, lag = 2.5e-3, {round(5 * SLOW, 6): 1e-6, round(FAST, 6): 2e-6}
+def test_the_stated_uncertainty_is_the_scatter():
+    """Monte Carlo: time offset and lags of 6 measurements against their stated deviation."""
+    drift, late = 2e-7, 2.5e-3
+    lag = {round(5 * SLOW, 6): 1e-6, round(FAST, 6): 2e-6}
     feeds = ((5 * SLOW, 0.4), (FAST, 0.8))
     offsets, found = [], []
-    for seed in range(12):
+    for seed in range(6):
         cycles = readings(Hidden(late=late, lag=lag, drift=drift), feeds, seed)
         scene, offset = align(describe(MACHINE, cycles), cycles)
         offsets.append((offset.value - late) / offset.stddev)
@@ -266,7 +266,7 @@ def test_the_stated_uncertainty_is_the_scatter(drift):
         assert low < np.sum(np.square(normal)) < high
 
 
-@pytest.mark.parametrize('drift', [0.0, 5e-8, 3e-7])
+@pytest.mark.parametrize('drift', [0.0, 3e-7])
 def test_the_strength_of_a_random_drift_is_found(drift):
     noise = gauge_rows(scene_of(Hidden(drift=drift), ((5 * SLOW, 1.2), (FAST, 2.2)))).noise
     assert noise.drift == pytest.approx(drift, rel=0.3)
@@ -287,7 +287,7 @@ def test_whitened_noise_is_white():
     assert (raw[1:] * raw[:-1]).sum() / (raw**2).sum() > 0.8
 
 
-@pytest.mark.parametrize('late', [-0.2, -0.03, 0.15])
+@pytest.mark.parametrize('late', [-0.2, 0.03])
 def test_clocks_that_are_far_apart_are_found(late):
     cycles = readings(Hidden(late=late))
     _, offset = align(describe(MACHINE, cycles), cycles)
@@ -315,6 +315,40 @@ def test_a_gap_in_the_readings_is_no_pass():
     none = replace(one, time=one.time[:20], centre=one.centre[:20])
     with pytest.raises(UserError, match='valid gauge readings while C turns'):
         make_scene(describe(MACHINE, [none]), [none])
+
+
+def test_every_cycle_has_a_zero_of_its_own():
+    """The nest a little elsewhere in the second cycle changes nothing but the zero."""
+    lag = {round(5 * SLOW, 6): 1e-6, round(FAST, 6): 2e-6}
+    cycles = readings(Hidden(lag=lag))
+    moved = [cycles[0], replace(cycles[1], centre=cycles[1].centre + [3e-7, 2e-7, -4e-7])]
+    one, other = (make_scene(describe(MACHINE, c), c) for c in (cycles, moved))
+    rows, same = gauge_rows(one), gauge_rows(other)
+    np.testing.assert_allclose(rows.residual, same.residual, atol=1e-11)
+    for a, b in zip(
+        lags(rows, encoder_rows(one)), lags(same, encoder_rows(other)), strict=True
+    ):
+        assert a.gauges[0] == pytest.approx(b.gauges[0], abs=1e-11)
+
+
+def test_a_cycle_of_one_direction_keeps_its_lag():
+    """Its tangential zero is not free: it would be the lag itself."""
+    both = readings(Hidden(), ((FAST, 0.7),))[0]
+    turns = np.argmax(both.feedback[:, 4])
+    halves = [slice(0, turns), slice(turns, None)]
+    single = []
+    for number, half in enumerate(halves):
+        logged = both.feedback_time[half]
+        read = (both.time >= logged[0]) & (both.time <= logged[-1])
+        single.append(replace(
+            both, cycle=str(number), time=both.time[read], centre=both.centre[read],
+            feedback_time=logged, feedback=both.feedback[half],
+        ))
+    for cycles, columns in (([both], 0), (single, 2)):
+        scene = make_scene(describe(MACHINE, cycles), cycles)
+        assert cycle_shifts(scene).shape[2] == columns
+        (found,) = lags(gauge_rows(scene), encoder_rows(scene))
+        assert found.gauges[1] < 0.1e-6
 
 
 def test_touching_probes_alone_have_friction():
