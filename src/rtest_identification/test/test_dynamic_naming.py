@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import pytest
 from dynamic_machine import FAST, RADIUS, SLOW, Hidden
 from test_dynamic_motion import MACHINE, readings
 
@@ -70,7 +71,7 @@ def test_servo_mismatch_is_seen_by_the_encoders():
     mismatch = -2e-5
     result = found(Hidden(mismatch=mismatch))
     assert names(result) == [('servo-mismatch/C', 'encoders')]
-    assert result.naming.verdict == 'no gap'
+    assert result.naming.verdict == 'explained'
     value, stddev = parameter(result, 'servo-mismatch/C', '1/Kv difference')
     assert abs(value - mismatch) < 5 * stddev
     # The lag is the shift turned round: the sphere before the nest has a negative one.

@@ -87,7 +87,7 @@ class Channel:
 
 @dataclass(frozen=True)
 class Naming:
-    """Verdict on the dynamic rest, and both channels."""
+    """Verdict on both channels together; whether something is left is judged on the gauges."""
 
     verdict: str
     encoders: Channel
@@ -114,7 +114,7 @@ def name_effects(encoders: Rows, gauges: Rows, offset: TimeOffset) -> Naming:
     offset = _joint_offset(shown, offset)
     shown, notes = _clocks(shown, offset)
     rest = judge_rest(gauge_rows(scene, shown.chosen, gauges.noise))
-    verdict = 'explained' if shown.effects else 'no gap'
+    verdict = 'explained' if servo.effects or shown.effects else 'no gap'
     if rest.probability < REST_ALARM or notes:
         verdict = 'partly explained' if shown.effects else 'unknown effect'
     return Naming(verdict, servo, shown, rest, offset, notes)

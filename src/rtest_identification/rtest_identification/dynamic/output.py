@@ -1,4 +1,4 @@
-"""`dynamic.json` (schema in the README) of one session."""
+"""`dynamic.json` (schema in docs/dynamic.md) of one session."""
 
 from __future__ import annotations
 
