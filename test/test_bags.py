@@ -10,7 +10,9 @@ from rosbags.highlevel import AnyReader
 
 from rtest_drivers.info import describe
 from rtest_drivers.sim.check import check
+from rtest_drivers.sim.truth import load_truth
 from rtest_estimation.recording import read_recording
+from rtest_identification.dynamic.offline import dynamic_recording
 from rtest_identification.gap.offline import gap_recording
 from rtest_identification.offline import identify_recording
 from rtest_identification.output import as_dict, write
@@ -76,6 +78,26 @@ def test_the_truth_of_the_independent_simulation_comes_back():
         for symbol, value in {**truth['location'], **truth['square']}.items()
     }
     assert len(z) == 11 and max(map(abs, z.values())) < 3.5, z
+
+
+def test_the_truth_of_the_dynamic_cell_comes_back():
+    truth = load_truth(TRUTH.with_name('cell_dynamic.yaml'))
+    (result,) = dynamic_recording(BAGS / 'dynamic').results
+    assert {(e.key, e.channel) for e in result.naming.effects} == {
+        ('servo-mismatch/C', 'encoders'), ('radius-shrink', 'encoders'),
+        ('friction-lag', 'gauges'), ('clock-offset', 'gauges'),
+    }
+    assert result.naming.verdict == 'explained'
+    friction = next(e for e in result.naming.effects if e.key == 'friction-lag')
+    assert not {'servo-mismatch/C', 'clock-offset'} & set(friction.rivals)
+    assert abs(result.offset.value - truth.gauges.late) < 4 * result.offset.stddev < 2e-3
+    later = truth.drives.rotary_lag - truth.drives.linear_lag
+    for one, lag, speed in zip(result.lags, (3e-6, 6e-6), (358, 3583), strict=True):
+        # The nest is calibrated to a few parts in ten thousand.
+        assert one.beyond[0] == pytest.approx(lag, rel=1e-3, abs=4 * one.beyond[1])
+        # C is late by less than X and Y: the sphere is behind.
+        servo = -later * np.radians(speed) / 60.0 * np.hypot(0.2e-3, 83.9e-3)
+        assert one.encoders[0] == pytest.approx(servo, abs=4 * one.encoders[1] + 1e-9)
 
 
 def test_the_report_is_one_file_that_opens_offline(tmp_path):

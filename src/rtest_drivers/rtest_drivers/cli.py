@@ -13,6 +13,7 @@ from rtest_drivers.commands import (
     ask,
     correct,
     demo,
+    dynamic,
     frustum,
     gap,
     identify,
@@ -28,7 +29,8 @@ from rtest_drivers.runner import NodeFailed, Stopped
 from rtest_estimation.errors import UserError
 
 COMMANDS = (
-    session, ask, demo, plan, identify, gap, thermal, frustum, correct, laser, replay, info,
+    session, ask, demo, plan, identify, gap, thermal, dynamic, frustum, correct, laser, replay,
+    info,
 )
 EXIT_FAILED, EXIT_USER, EXIT_INTERRUPTED, EXIT_PIPE = 1, 2, 130, 141
 

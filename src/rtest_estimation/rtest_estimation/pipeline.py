@@ -18,7 +18,7 @@ from rtest_estimation import nest as nests
 from rtest_estimation.average import Average, NoAverageError, average
 from rtest_estimation.buffers import FeedbackBuffer, GaugeBuffer
 from rtest_estimation.columns import FeedbackColumns
-from rtest_estimation.cycle_end import CycleEnd
+from rtest_estimation.cycle_end import CycleEnd, arrivals
 from rtest_estimation.cycle_start import CycleStart
 from rtest_estimation.dwell import ROTARY_LETTERS, Dwell, DwellRules, find_dwells
 from rtest_estimation.records import (
@@ -182,9 +182,11 @@ class Estimator:
         self._reset()
         self._forget(self._plans[0].stamp if self._plans else end)
         if plan.kind is Kind.DYNAMIC:
-            reason = 'dynamic cycles are recorded but not evaluated'
-            missing = tuple(Missing(row, reason) for row in range(len(plan.commands)))
-            return Finished(Cycle(plan, (), missing, '', end), problem=reason)
+            # Its readings are evaluated one by one, not as poses.
+            came = len(arrivals(plan, positions, self.rules.dwell))
+            rest = range(came, len(plan.commands))
+            missing = tuple(Missing(row, 'never reached') for row in rest)
+            return Finished(Cycle(plan, (), missing, '', end))
         dwells, missing = find_dwells(plan, stamps, positions, self.rules.dwell, end)
         data = (times, displacement, status)
         if plan.kind is Kind.NEST_CALIBRATION:

@@ -18,7 +18,7 @@ from rtest_identification.moves import AxisPath, synchronous_path
 from rtest_identification.nc_program import NcSettings, nc_program
 from rtest_identification.plan_check import NOT_CHECKED, PlanCheck, check_plan
 from rtest_identification.plans import program_name
-from rtest_identification.session_file import PACE, SessionConfig
+from rtest_identification.session_file import DYNAMIC, PACE, SessionConfig
 
 COVERAGE_FACTOR = 2.0
 
@@ -28,12 +28,13 @@ class CheckedPlan:
     """A session's cycles with their moves, checked, and what they will determine.
 
     paths, checks : of every distinct cycle; a repeated one is there once, and foreseen once
+    foresight : of the static cycles; None where there is none
     """
 
     config: SessionConfig
     paths: tuple[AxisPath, ...]
     checks: tuple[PlanCheck, ...]
-    foresight: Foresight
+    foresight: Foresight | None
 
     @property
     def duration(self) -> float:
@@ -44,6 +45,9 @@ class CheckedPlan:
     @property
     def warnings(self) -> tuple[str, ...]:
         """What somebody should know before measuring."""
+        checks = tuple(text for check in self.checks for text in check.warnings)
+        if self.foresight is None:
+            return checks
         location = self.foresight.location
         lost = [p.symbol for p, good in zip(location.parameters, location.determined, strict=True)
                 if not good]
@@ -60,7 +64,7 @@ class CheckedPlan:
                 f'a cycle takes {self.checks[-1].duration / 60.0:.1f} min and is to be repeated '
                 f'every {every / 60.0:g} min: the cycles will be late'
             )
-        return (*found, *(text for check in self.checks for text in check.warnings))
+        return (*found, *checks)
 
     @property
     def unchecked(self) -> str:
@@ -85,7 +89,10 @@ def check_session(
         check_plan(machine, plan, path, config.approach, config.table, config.spindle)
         for plan, path in zip(config.distinct, paths, strict=True)
     )
-    return CheckedPlan(config, paths, checks, foresee(machine, config.distinct, paths, noise))
+    foresight = None
+    if config.kind != DYNAMIC:
+        foresight = foresee(machine, config.distinct, paths, noise)
+    return CheckedPlan(config, paths, checks, foresight)
 
 
 def write_plan(
@@ -120,7 +127,8 @@ def write_plan(
             )
             number += 1
         cycles.append(entry)
-    files['error_motions.csv'] = _error_motions(checked.foresight)
+    if checked.foresight is not None:
+        files['error_motions.csv'] = _error_motions(checked.foresight)
     files['machine.yaml'] = config.machine.text
     files['session.yaml'] = _session(config)
     data = _as_dict(checked, session) | {'cycles': cycles}
@@ -178,12 +186,15 @@ def _error_motions(seen: Foresight) -> str:
 
 def _session(config: SessionConfig) -> str:
     """The session file with the cycle as it was planned, beside its machine file."""
-    cycle = dict(config.data.get('cycle', {})) | {'kind': config.kind}
-    for name, stations in zip(config.machine.rotary, config.stations, strict=True):
-        cycle[f'{name.lower()}_deg'] = [round(v, 9) + 0.0 for v in np.degrees(stations).tolist()]
-    if not config.every:
-        cycle = {key: value for key, value in cycle.items() if key not in PACE}
-    data = config.data | {'machine': 'machine.yaml', 'cycle': cycle}
+    data = config.data | {'machine': 'machine.yaml'}
+    if config.kind != DYNAMIC:
+        cycle = dict(config.data.get('cycle', {})) | {'kind': config.kind}
+        for name, stations in zip(config.machine.rotary, config.stations, strict=True):
+            degrees = np.degrees(stations).tolist()
+            cycle[f'{name.lower()}_deg'] = [round(v, 9) + 0.0 for v in degrees]
+        if not config.every:
+            cycle = {key: value for key, value in cycle.items() if key not in PACE}
+        data['cycle'] = cycle
     if config.devices:
         # Their files stay where they are.
         data['devices'] = {
@@ -196,19 +207,25 @@ def _session(config: SessionConfig) -> str:
 
 def _as_dict(checked: CheckedPlan, session: str) -> dict[str, Any]:
     config, seen = checked.config, checked.foresight
-    rotary = [p.axis in config.machine.rotary for p in seen.location.parameters]
-    maps = [m for m in (seen.outer_map, seen.inner_map) if m is not None]
-    return {
+    common = {
         'session': session,
         'machine': config.machine.name,
         'kind': config.kind,
         'repeated': {'every': config.every, 'cycles': config.repetitions}
         if config.every else None,
+        'duration': checked.duration,
+        'not_checked': checked.unchecked,
+        'warnings': list(checked.warnings),
+    }
+    if seen is None:
+        return common
+    rotary = [p.axis in config.machine.rotary for p in seen.location.parameters]
+    maps = [m for m in (seen.outer_map, seen.inner_map) if m is not None]
+    return common | {
         'stations': {
             name: values.tolist()
             for name, values in zip(config.machine.rotary, config.stations, strict=True)
         },
-        'duration': checked.duration,
         'noise': seen.noise,
         'coverage_factor': COVERAGE_FACTOR,
         'poses': seen.poses,
@@ -223,8 +240,6 @@ def _as_dict(checked: CheckedPlan, session: str) -> dict[str, Any]:
             }
             for o in seen.outlooks
         ],
-        'not_checked': checked.unchecked,
-        'warnings': list(checked.warnings),
     }
 
 

@@ -1,4 +1,4 @@
-"""Measurement cycles: what the machine is commanded to do (sections 2.2.2, 3.3 and 3.7.1)."""
+"""What the machine is commanded to do in a cycle (sections 2.2.2, 3.3, 3.7.1 and 5.7.2)."""
 
 from __future__ import annotations
 
@@ -26,6 +26,9 @@ UNEVEN_DEG = (0, 50, 60, 80, 110, 145, 160, 200, 240, 270, 315, 335)
 # backlash and enough to be a pose of its own, less than what counts as another station [rad].
 OVERRUN = math.radians(0.05)
 _REPEATED = re.compile(r'(.*-thermal)-\d+')
+# A dynamic cycle rests so long where it turns round: the readings have settled, and the end of the
+# cycle is seen by half of it [s].
+DYNAMIC_REST = 1.0
 
 
 def nest_calibration(
@@ -186,6 +189,25 @@ def diagnostic(
     poses = [zero, below, *upward, zero, above, *downward, zero]
     commands = linear_positions(machine, sphere, _rotary(machine, poses))
     return _plan(machine, Kind.STATIC, setup, 'diagnostic', sphere, commands, dwell)
+
+
+def dynamic(
+    machine: Machine, setup: str, sphere: np.ndarray, axis: str, speed: float, turns: float
+) -> CyclePlan:
+    """One rotary axis to and fro at a constant speed, the linear axes following (section 5.7.2).
+
+    speed : [rad/s]; turns : each way, from zero upwards where the range allows it, else as far on
+        both sides of zero
+    """
+    travel = 2.0 * math.pi * turns
+    start = 0.0 if travel <= machine.axes[axis].upper + 1e-9 else -0.5 * travel
+    rows = np.zeros((3, len(machine.letters)))
+    rows[:, machine.letters.index(axis)] = start, start + travel, start
+    # The path speed of a motion that a rotary axis leads, for a person in deg/min.
+    name = f'dynamic-{math.degrees(speed) * 60.0:.0f}'
+    commands = linear_positions(machine, sphere, rows)
+    plan = _plan(machine, Kind.DYNAMIC, setup, name, sphere, commands, 0.0)
+    return replace(plan, feed=speed)
 
 
 def _sweep(outer: np.ndarray, inner: np.ndarray) -> list[tuple[float, float]]:

@@ -21,6 +21,7 @@ from rtest_identification.plans import (
     UNEVEN_DEG,
     check_ranges,
     diagnostic,
+    dynamic,
     program_name,
     spindle_runout,
     static,
@@ -29,7 +30,7 @@ from rtest_identification.plans import (
 from rtest_identification.session_nest import DWELL_S, calibration_plan, laser_checks, nest_kind
 from rtest_identification.session_reader import Reader
 
-STATIC, DIAGNOSTIC, THERMAL = 'static', 'diagnostic', 'thermal'
+STATIC, DIAGNOSTIC, THERMAL, DYNAMIC = 'static', 'diagnostic', 'thermal', 'dynamic'
 # Fewer do not tell offset, sine and cosine of an error over the axis from each other.
 FEWEST_STATIONS = 3
 # Closer ones are one pose for the machine and for who looks for its stops.
@@ -37,6 +38,8 @@ CLOSEST_DEG = 0.1
 _RADIUS_MM = (1.0, 100.0)
 # Six points tell a circle from noise.
 _RUNOUT_STATIONS = (6, 360)
+# Less of a turn than this shows no harmonics; nobody waits for more.
+_TURNS = (0.25, 100.0)
 _NAME = re.compile(r'[A-Za-z0-9][A-Za-z0-9._-]*')
 _BUILD = {STATIC: static, DIAGNOSTIC: diagnostic, THERMAL: static}
 # Of a thermal session: between the starts of its cycles, and from the first to the last of them.
@@ -44,8 +47,8 @@ _EVERY_MIN, _HOURS = (0.1, 24.0 * 60.0), (0.01, 24.0 * 14.0)
 _MOST_CYCLES = 2000
 PACE = ('every_min', 'hours')
 _KEYS = {
-    'machine', 'sphere_radius_mm', 'cycle', 'nest_calibration', 'spindle_runout', 'setups',
-    'moves', 'table', 'spindle', 'devices', 'nest', 'verification', 'scan',
+    'machine', 'sphere_radius_mm', 'cycle', 'dynamic', 'nest_calibration', 'spindle_runout',
+    'setups', 'moves', 'table', 'spindle', 'devices', 'nest', 'verification', 'scan',
 }
 # The drivers that a session can start; what their backends are is the drivers' affair.
 _DRIVERS = ('gauges', 'cnc', 'thermometers')
@@ -74,8 +77,9 @@ class SessionConfig:
     sphere_radius : [m]
     nest : of contact gauges or of lasers
     plans : in order, each with stamp 0 and an empty session name until it is started
-    kind : of the cycle, 'static', 'diagnostic' or 'thermal'
-    stations : of each rotary axis [rad], outer one first
+    kind : of the cycle, 'static', 'diagnostic' or 'thermal'; 'dynamic' where there are dynamic
+        ones only
+    stations : of each rotary axis [rad], outer one first; none where there is no static cycle
     speeds, approach : how the axes move between poses, and to the first pose
     table, spindle : bodies that must not touch; None where the file says nothing of them
     devices : of the drivers 'gauges', 'cnc' and 'thermometers'; a driver that is not in it is
@@ -126,11 +130,19 @@ def load_session(path: Path | str, kind: str | None = None) -> SessionConfig:
     data = read_yaml(path, 'the session file')
     if not isinstance(data, dict):
         raise UserError(f'{path}: expected a mapping with machine, cycle and setups')
+    if 'cycle' not in data and 'dynamic' not in data:
+        raise UserError(f'{path}: cycle: missing; expected cycle, dynamic or both')
     reader = Reader(str(path), data)
     reader.only(_KEYS)
     machine = load_machine(path.parent / str(reader.required('machine')))
     radius = reader.number('sphere_radius_mm', 12.7, _RADIUS_MM) * 1e-3
-    kind, stations, dwell = _cycle(reader, machine, kind)
+    turning = _dynamic(reader, machine)
+    if 'cycle' in data:
+        kind, stations, dwell = _cycle(reader, machine, kind)
+    elif kind is not None:
+        raise UserError(f'{path}: cycle: missing; a {kind} cycle needs its stations')
+    else:
+        kind, stations, dwell = DYNAMIC, (), 0.0
     nest = nest_kind(reader)
     every, repetitions = _repetition(reader, kind)
     plans: list[CyclePlan] = []
@@ -155,8 +167,10 @@ def load_session(path: Path | str, kind: str | None = None) -> SessionConfig:
                 count = section.integer('stations', 24, _RUNOUT_STATIONS)
                 runout_dwell = section.number('dwell_s', 0.3, DWELL_S)
                 plans.append(spindle_runout(machine, name, sphere, count, runout_dwell))
-        cycle = _BUILD[kind](machine, name, sphere, *stations, dwell)
-        plans += thermal(cycle, repetitions) if kind == THERMAL else [cycle]
+        if kind in _BUILD:
+            cycle = _BUILD[kind](machine, name, sphere, *stations, dwell)
+            plans += thermal(cycle, repetitions) if kind == THERMAL else [cycle]
+        plans += [dynamic(machine, name, sphere, *each) for each in turning]
     for plan in plans:
         try:
             check_ranges(machine, plan)
@@ -208,6 +222,34 @@ def _repetition(reader: Reader, kind: str) -> tuple[float, int]:
             f'cycles; expected 2 to {_MOST_CYCLES}'
         )
     return 60.0 * every, count
+
+
+def _dynamic(reader: Reader, machine: Machine) -> list[tuple[str, float, float]]:
+    """Axis, speed [rad/s] and turns each way of every dynamic cycle; none without the section."""
+    if 'dynamic' not in reader.data:
+        return []
+    section = reader.section('dynamic', {'axis', 'speeds_deg_min', 'turns'})
+    axis, tables = section.required('axis'), [
+        name for name in machine.rotary if name in machine.table_side
+    ]
+    if axis not in tables:
+        raise UserError(
+            f'{section.where}: axis: expected a rotary axis of the table, {" or ".join(tables)}, '
+            f'got {axis!r}'
+        )
+    speeds, turns = section.numbers('speeds_deg_min'), section.numbers('turns')
+    if min(speeds) <= 0.0 or len(set(speeds)) < len(speeds):
+        raise UserError(
+            f'{section.where}: speeds_deg_min: expected different positive numbers, got {speeds}'
+        )
+    lower, upper = _TURNS
+    if len(turns) != len(speeds) or not all(lower <= value <= upper for value in turns):
+        raise UserError(
+            f'{section.where}: turns: expected {lower:g} to {upper:g} for each of the '
+            f'{len(speeds)} speeds, got {turns}'
+        )
+    return [(axis, math.radians(speed) / 60.0, turn)
+            for speed, turn in zip(speeds, turns, strict=True)]
 
 
 def _stations(cycle: Reader, key: str, axis: Axis) -> list[float]:

@@ -5,6 +5,7 @@ import pytest
 from independent import NMV, B, C
 
 from rtest_estimation.errors import UserError
+from rtest_estimation.records import Kind
 from rtest_identification.error_map import STATION, stations
 from rtest_identification.kinematics import predict
 from rtest_identification.machine import parse_machine
@@ -175,10 +176,40 @@ spindle: {radius_mm: 45, distance_mm: 160}
     assert config.spindle.radius == pytest.approx(0.045)
 
 
+TURNING = 'dynamic: {axis: C, speeds_deg_min: [358, 3583], turns: [1, 2]}\n'
+
+
+def test_dynamic_cycles_follow_the_static_one_or_stand_alone(tmp_path):
+    both = load_session(session(tmp_path, SESSION + TURNING))
+    assert [p.cycle for p in both.plans] == [
+        '1a-nest', '1a-static', '1a-dynamic-358', '1a-dynamic-3583']
+    without = '\n'.join(line for line in SESSION.splitlines() if not line.startswith('cycle'))
+    alone = load_session(session(tmp_path, without + '\n' + TURNING))
+    assert (alone.kind, alone.stations) == ('dynamic', ())
+    slow, fast = alone.plans[1:]
+    assert slow.kind is Kind.DYNAMIC and slow.dwell == 0.0
+    assert np.degrees(slow.feed) * 60.0 == pytest.approx(358.0)
+    # To and fro, with two turns around zero where the axis has one to each side.
+    np.testing.assert_allclose(np.degrees(slow.commands[:, 4]), [0, 360, 0], atol=1e-9)
+    np.testing.assert_allclose(np.degrees(fast.commands[:, 4]), [-360, 360, -360], atol=1e-9)
+    with pytest.raises(UserError, match='cycle: missing'):
+        load_session(session(tmp_path, without + '\n' + TURNING), 'static')
+    with pytest.raises(UserError, match='expected cycle, dynamic or both'):
+        load_session(session(tmp_path, without))
+
+
 @pytest.mark.parametrize(
     ('old', 'new', 'words'),
     [
         ('cycle: {', 'cycle: {kind: dynamic, ', 'kind: expected static or diagnostic'),
+        ('cycle:', 'dynamic: {axis: X}\ncycle:', 'axis: expected a rotary axis of the table'),
+        ('cycle:', 'dynamic: {axis: C}\ncycle:', 'dynamic: speeds_deg_min: missing'),
+        ('cycle:', 'dynamic: {axis: C, speeds_deg_min: [9, 9], turns: [1, 1]}\ncycle:',
+         'expected different positive numbers'),
+        ('cycle:', 'dynamic: {axis: C, speeds_deg_min: [9, 90], turns: [1]}\ncycle:',
+         'turns: expected 0.25 to 100 for each of the 2 speeds'),
+        ('cycle:', 'dynamic: {axis: C, speeds_deg_min: [9], turns: [3]}\ncycle:',
+         'C = -540.000 deg is outside'),
         ('{b_deg: [-75, 0, 75],', '{', 'b_deg: missing'),
         ('{b_deg: [-75, 0, 75],', '{kind: diagnostic,', 'b_deg: missing'),
         ('b_deg', 'a_deg', "unknown key 'a_deg'"),

@@ -442,6 +442,8 @@ class SessionNode(Node):
             # Every reason is told with the result of the session.
             first, *more = grouped(missing) or ['']
             text += f' ({first}{"; ..." if more else ""})' if first else ''
+        if plan.kind is Kind.DYNAMIC and not cycle.missing:
+            return 'recorded'
         if plan.kind is Kind.NEST_CALIBRATION:
             # The calibration is on another topic and may come a moment later.
             self.wait(lambda: cycle.calibration in self._nests, 1.0 if cycle.calibration else 0.0)
@@ -451,12 +453,9 @@ class SessionNode(Node):
 
     def _judge(self, started: dict[str, list[tuple[str, int]]]) -> None:
         """A cycle that says nothing is a problem; single missing poses are not."""
-        kinds = {plan.cycle: plan.kind for plan in self.config.plans}
         lost = [
             name for name, keys in started.items()
-            if kinds[name] is not Kind.DYNAMIC
-            # Displacements count from the first point: alone it is zero.
-            if not any(key in self._cycles and len(self._cycles[key].points) > 1 for key in keys)
+            if not any(key in self._cycles and _says(self._cycles[key]) for key in keys)
         ]
         if lost:
             self._problem(f'incomplete: nothing was measured in {", ".join(lost)}')
@@ -599,6 +598,17 @@ class SessionNode(Node):
             'problems': len(self._problems),
         }
         self._diagnostics.publish(diagnostics.status('session: progress', level, text, values))
+
+
+def _says(cycle: Cycle) -> bool:
+    """Whether a finished cycle says anything.
+
+    Displacements of poses count from the first point: alone it is zero. A dynamic cycle has
+    readings only, of which those between its poses count.
+    """
+    if cycle.plan.kind == Kind.DYNAMIC:
+        return len(cycle.plan.commands) // len(cycle.plan.axes) - len(cycle.missing) > 1
+    return len(cycle.points) > 1
 
 
 def main(args: list[str] | None = None) -> int:

@@ -19,6 +19,7 @@ from rtest_drivers.sim.kinematics import sphere_in_table, table_to_spindle, turn
 from rtest_drivers.sim.motion import SPINDLE, Timeline
 from rtest_drivers.sim.truth import Truth
 from rtest_drivers.sim.warming import WarmErrors
+from rtest_estimation.dwell import turns
 from rtest_estimation.errors import UserError
 from rtest_estimation.records import (
     CyclePlan,
@@ -33,6 +34,9 @@ _READINGS, _OUTLIERS, _ENCODERS, _THERMOMETERS = 1, 2, 3, 4
 # Around a cycle everything is read as usual for so long: the end of one and the start of the next
 # are seen in the readings [ns].
 _NEAR_NS = 5_000_000_000
+# A dynamic cycle rests so long wherever it turns round; half the time over which speeds are
+# differences [ns].
+_REST, _HALF_SPAN = 1_000_000_000, 1_000_000
 # From and to [ns].
 Wait = tuple[int, int] | None
 
@@ -170,7 +174,8 @@ class Cell:
             for fault in self.truth.faults
             if fault.kind == 'pose_skipped' and fault.cycle == plan.cycle
         }
-        dwell = round(plan.dwell * 1e9)
+        turning = turns(plan)
+        dwell = _REST if turning else round(plan.dwell * 1e9)
         columns = [self.axes.index(name) for name in plan.axes]
         poses: dict[int, tuple[int, int]] = {}
         clock = start
@@ -181,11 +186,10 @@ class Cell:
             if SPINDLE not in plan.axes:
                 target[-1] = 0.0
             target[columns] = row
-            offset = self.truth.gauges.dwell_noise * self._named(
-                f'{plan.cycle}/{pose}'
-            ).standard_normal(3)
-            # A dynamic cycle goes at its feed from pose to pose, without a stop.
-            feed = plan.feed if plan.kind is Kind.DYNAMIC and pose else None
+            # Nothing settles anew where a dynamic cycle turns round.
+            name = plan.cycle if turning else f'{plan.cycle}/{pose}'
+            offset = self.truth.gauges.dwell_noise * self._named(name).standard_normal(3)
+            speed = plan.feed if plan.kind is Kind.DYNAMIC and poses else 0.0
             if plan.setup != self._setup:
                 self._setup = plan.setup
                 leg = self._timeline.append(clock, target, -1, offset)
@@ -194,7 +198,7 @@ class Cell:
                 self._timeline.rest(clock, len(self._nests) - 1, offset)
             else:
                 clock = self._timeline.append(
-                    clock, target, len(self._nests) - 1, offset, feed
+                    clock, target, len(self._nests) - 1, offset, speed, turning
                 ).arrival
             poses[pose] = (clock, clock + dwell)
             clock += dwell
@@ -244,7 +248,7 @@ class Cell:
                 if not lost[part].any():
                     blocks.append(
                         GaugeBlock(
-                            int(times[first]),
+                            int(times[first]) + round(data.late * 1e9),
                             self._sequence,
                             data.period * 1e-9 if data.batch > 1 else 0.0,
                             values[part],
@@ -270,6 +274,9 @@ class Cell:
         if mounted.any():
             sphere = self._sphere(state.positions[mounted], times[mounted])
             sphere += state.offset[mounted]
+            if data.friction:
+                velocity = self._velocity(times[mounted], state.positions[mounted])
+                sphere += gauges.friction(data, velocity)
             surface = self._to_sphere(state.positions[mounted]) if data.laser else None
             held, found = values[mounted], status[mounted]
             for index in np.unique(state.nest[mounted]):
@@ -304,6 +311,17 @@ class Cell:
         machine = self.truth.machine
         spindle = turn(np.array([0.0, 0.0, 1.0]), -positions[:, -1])[:, :3, :3]
         return spindle @ table_to_spindle(machine, positions[:, :-1])
+
+    def _velocity(self, times: np.ndarray, positions: np.ndarray) -> np.ndarray:
+        """(n, 3) how the linear axes carry the sphere, frame ``table`` [m/s]."""
+        machine = self.truth.machine
+        linear = [machine.letters.index(name) for name in machine.linear]
+        ends = []
+        for step in (-_HALF_SPAN, _HALF_SPAN):
+            moved = positions[:, :-1].copy()
+            moved[:, linear] = self._timeline.at(times + step).positions[:, linear]
+            ends.append(sphere_in_table(machine, moved))
+        return (ends[1] - ends[0]) / (2e-9 * _HALF_SPAN)
 
     def _spoil(
         self, times: np.ndarray, values: np.ndarray, status: np.ndarray
@@ -385,10 +403,16 @@ def check(plan: CyclePlan, truth: Truth) -> None:
     """
     where = f'plan {plan.cycle!r}'
     axes = truth.machine.axes
-    rotary = [column for column, name in enumerate(plan.axes)
-              if name not in axes or axes[name].rotary]
-    if plan.kind is Kind.DYNAMIC and np.ptp(plan.commands[:, rotary], axis=0).any():
-        raise UserError(f'{where}: the simulated cell does dynamic cycles of linear axes only')
+    if turns(plan):
+        turned = [k for k, name in enumerate(plan.axes) if name in axes and axes[name].rotary]
+        steps = np.abs(np.diff(plan.commands[:, turned], axis=0))
+        if not plan.feed > 0.0 or steps.max(axis=1).min() < 1e-9:
+            raise UserError(
+                f'{where}: a dynamic cycle turns a rotary axis between all of its poses, with a '
+                'feed, or none between any'
+            )
+    elif plan.kind is Kind.DYNAMIC and not plan.feed > 0.0:
+        raise UserError(f'{where}: a dynamic cycle has a feed')
     for column, name in enumerate(plan.axes):
         if name == SPINDLE:
             continue

@@ -10,6 +10,9 @@ import numpy as np
 from rtest_drivers.sim import laser
 from rtest_estimation.records import Status
 
+# Slower than this the sphere stands still [m/s].
+_CREEPING = 1e-4
+
 
 @dataclass(frozen=True)
 class LaserData:
@@ -39,6 +42,9 @@ class GaugeData:
     outliers, outlier : share of readings, standard deviation [m]
     laser : None for contact gauges; noise and range are then the sensor's, and a mounting has
         `position_error` no more
+    late : by how much the stamps are later than the encoders' [s]
+    friction : how far touching probes trail the motion at `friction_speed` [m], [m/s], and with
+        which power of the speed that grows
     """
 
     azimuth: np.ndarray
@@ -54,6 +60,10 @@ class GaugeData:
     outliers: float = 0.0
     outlier: float = 0.0
     laser: LaserData | None = None
+    late: float = 0.0
+    friction: float = 0.0
+    friction_speed: float = 0.01
+    friction_power: float = 0.0
 
     @property
     def directions(self) -> np.ndarray:
@@ -107,3 +117,14 @@ def mount(data: GaugeData, sphere: np.ndarray, rng: np.random.Generator) -> Nest
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     origin = sphere + data.position_error * rng.standard_normal(3)
     return Nest(directions, origin, data.lower, data.upper)
+
+
+def friction(data: GaugeData, velocity: np.ndarray) -> np.ndarray:
+    """(n, 3) by how much the probes show the sphere behind its motion [m].
+
+    velocity : (n, 3) of the sphere, frame ``table`` without the table's own turning [m/s]
+    """
+    speed = np.linalg.norm(velocity, axis=1)
+    size = data.friction * (speed / data.friction_speed) ** data.friction_power
+    # A sphere that hardly moves has no side on which to hang back.
+    return -velocity * (size / np.maximum(speed, _CREEPING))[:, None]

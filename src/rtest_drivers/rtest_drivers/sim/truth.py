@@ -120,7 +120,7 @@ def _gauges(fields: Fields) -> GaugeData:
             fields.number('distance_error_um', 0.0, 0.0, _UM),
         )
         lower, upper, noise = lasers.sensor.lower, lasers.sensor.upper, lasers.sensor.noise
-    outliers = fields.section('outliers')
+    outliers, friction = fields.section('outliers'), fields.section('friction')
     data = GaugeData(
         azimuth,
         tilt,
@@ -135,8 +135,13 @@ def _gauges(fields: Fields) -> GaugeData:
         outliers.number('share', 0.0, 0.0),
         outliers.number('size_um', 0.0, 0.0, _UM),
         lasers,
+        fields.number('late_ms', 0.0, scale=_MS),
+        friction.number('lag_um', 0.0, 0.0, _UM),
+        friction.number('speed_mm_s', 10.0, 0.01, _MM),
+        friction.number('power', 0.0),
     )
     outliers.done()
+    friction.done()
     fields.done()
     if np.linalg.matrix_rank(data.directions, tol=1e-3) < 3:
         raise UserError(f'{fields.where}: directions: expected three that span the space')
@@ -157,7 +162,7 @@ def _encoders(fields: Fields) -> Encoders:
 
 def _drives(fields: Fields) -> Drives:
     base = Drives()
-    settle = fields.section('settle')
+    settle, lag, start = (fields.section(name) for name in ('settle', 'lag', 'start'))
     drives = Drives(
         fields.number('linear_mm_s', base.linear, 1.0, _MM),
         fields.number('rotary_deg_s', base.rotary, 1.0, _DEG),
@@ -165,8 +170,15 @@ def _drives(fields: Fields) -> Drives:
         settle.number('amplitude_um', base.settle, 0.0, _UM),
         settle.number('frequency_hz', base.frequency, 1.0),
         settle.number('decay_ms', base.decay, 0.1, _MS),
+        fields.number('rotary_deg_s2', base.acceleration, 1.0, _DEG),
+        lag.number('linear_ms', 0.0, 0.0, _MS),
+        lag.number('rotary_ms', 0.0, 0.0, _MS),
+        start.number('way_ms', 0.0, 0.0, _MS),
+        start.number('frequency_hz', base.start_frequency, 1.0),
+        start.number('decay_ms', base.start_decay, 0.1, _MS),
     )
-    settle.done()
+    for section in (settle, lag, start):
+        section.done()
     fields.done()
     return drives
 

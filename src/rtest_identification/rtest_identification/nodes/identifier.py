@@ -95,6 +95,10 @@ class IdentifierNode(Node):
             self._map.publish(publish.grid_map(result, result.inner_map, stamp))
 
     def _on_finish(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        if self._cycles and not any(c.plan.kind is Kind.STATIC for c in self._cycles):
+            response.success = any(c.plan.kind is Kind.DYNAMIC for c in self._cycles)
+            response.message = 'no static cycle to identify'
+            return response
         self._identify()
         response.success = self._result is not None
         response.message = self._summary()
