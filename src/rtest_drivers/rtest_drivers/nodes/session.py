@@ -163,14 +163,15 @@ class SessionNode(Node):
         Raises SessionError where it cannot go on.
         """
         self._wait_for_nodes()
+        if self.simulated:
+            # The drivers are opened next, and need it.
+            self._wait_for('/clock of the simulated cell', lambda: self._now() > 0)
         self._machine.publish(String(data=self.config.machine.text))
         for name in self._drivers:
             self._bring_to(name, State.PRIMARY_STATE_INACTIVE)
         self._wait_for_listeners()
         for name in self._drivers:
             self._bring_to(name, State.PRIMARY_STATE_ACTIVE)
-        if self.simulated:
-            self._wait_for('/clock of the simulated cell', lambda: self._now() > 0)
         poses = sum(len(plan.commands) for plan in self.config.plans)
         self.say(f'{self.config.machine.name}: {len(self.config.plans)} cycles, {poses} poses')
         started = {}

@@ -14,12 +14,16 @@ from rtest_identification.uncertainty import COVERAGE_FACTOR
 
 # A session shorter than this is told in minutes [s].
 HOURS = 7200.0
+# What is shorter is told in seconds [s].
+_FEW = 120.0
 
 
 def minutes(seconds: float) -> str:
-    """For example 15 min; hours where it is many."""
+    """For example 15 min; seconds where it is few, hours where it is many."""
     if not math.isfinite(seconds):
         return '∞'
+    if abs(seconds) < _FEW:
+        return f'{seconds:.0f} s'
     if abs(seconds) < HOURS:
         return f'{seconds / 60.0:.0f} min'
     return f'{seconds / 3600.0:.1f} h'
