@@ -21,6 +21,7 @@ from rtest_estimation.recording import (
     recording_of,
     temperatures,
 )
+from rtest_estimation.records import Kind
 from rtest_identification.gap.effects import Effect, library
 from rtest_identification.gap.model_file import Model, load_model
 from rtest_identification.gap.scene import Scene
@@ -48,9 +49,11 @@ def estimate_recording(
     def note(ready: Finished) -> None:
         done.append(ready)
         cycle = ready.cycle
+        poses = f'{len(cycle.points)} of {len(cycle.plan.commands)} poses'
+        if cycle.plan.kind is Kind.DYNAMIC:
+            poses = 'dynamic, for `rtest dynamic`'
         progress(
-            f'{cycle.plan.cycle}: {len(cycle.points)} of {len(cycle.plan.commands)} poses'
-            + (f' ({ready.problem})' if ready.problem else '')
+            f'{cycle.plan.cycle}: {poses}' + (f' ({ready.problem})' if ready.problem else '')
         )
 
     for plan in recording.plans:
