@@ -123,11 +123,11 @@ class Session:
     """A running `rtest session`, and what it says."""
 
     def __init__(self, machine: Machine) -> None:
-        self.out = machine.folder / 'out'
+        self.out, self.domain = machine.folder / 'out', str(free_domain())
         self._process = subprocess.Popen(
             [sys.executable, '-m', 'rtest_drivers.cli', 'session', '--config',
              str(machine.config), '--session', 'faults', '--out', str(self.out), '--domain',
-             str(free_domain())],
+             self.domain],
             stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
             env={**os.environ, 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'},
         )
@@ -201,6 +201,9 @@ def test_faults_of_a_session(tmp_path: Path) -> None:
         session = Session(machine)
         try:
             session.until('start the NC program of a-nest: 28 poses')
+            assert main(['ask', 'repeat', '--domain', session.domain]) == 0
+            session.until('repeat, as was asked for')
+            session.until('start the NC program of a-nest: 28 poses')
             for pose in machine.play('a-nest'):
                 if pose == 10:
                     note('unplugged')
@@ -237,12 +240,12 @@ def test_faults_of_a_session(tmp_path: Path) -> None:
     assert [level for _, level, _ in cnc][-1] == 0, 'it is well again'
 
     recording = read_recording(folder)
-    assert recording.closed and len(recording.plans) == 3
+    assert recording.closed and len(recording.plans) == 4
     nest, static = (one.cycle for one in estimate_recording(recording))
     assert {m.index for m in nest.missing} <= {10, 11, 12, 13} and nest.missing
     assert all(m.reason.startswith('gauge 3 no signal') for m in nest.missing), nest.missing
     # Of the second attempt at the static cycle the pose is missing at which nobody answered.
-    assert static.plan.stamp == recording.plans[2].stamp
+    assert static.plan.stamp == recording.plans[3].stamp
     assert [m.index for m in static.missing] == [6]
     assert 'stale' in static.missing[0].reason
     assert len(static.points) == 10

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from typing import NoReturn
 
 from rtest_drivers.commands import (
+    ask,
     correct,
     demo,
     dynamic,
@@ -17,7 +18,9 @@ from rtest_drivers.commands import (
     gap,
     identify,
     info,
+    laser,
     plan,
+    replay,
     session,
     thermal,
 )
@@ -25,7 +28,10 @@ from rtest_drivers.graph import ONE_THREAD
 from rtest_drivers.runner import NodeFailed, Stopped
 from rtest_estimation.errors import UserError
 
-COMMANDS = (session, demo, plan, identify, gap, thermal, dynamic, frustum, correct, info)
+COMMANDS = (
+    session, ask, demo, plan, identify, gap, thermal, dynamic, frustum, correct, laser, replay,
+    info,
+)
 EXIT_FAILED, EXIT_USER, EXIT_INTERRUPTED, EXIT_PIPE = 1, 2, 130, 141
 
 

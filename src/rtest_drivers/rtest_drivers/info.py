@@ -5,14 +5,13 @@ from __future__ import annotations
 from datetime import datetime, timezone
 from pathlib import Path
 
-import yaml
-
 from rtest_estimation.bagfile import Bag, read_bag
 from rtest_estimation.errors import UserError
 from rtest_estimation.missing import grouped
 from rtest_estimation.pipeline import Finished
 from rtest_estimation.recording import TYPES, Recording, recording_of
 from rtest_estimation.records import CyclePlan
+from rtest_estimation.yaml_text import load_yaml
 from rtest_identification.offline import estimate_recording
 
 
@@ -83,8 +82,8 @@ def _machine_name(text: str | None) -> str:
     if text is None:
         return 'not recorded'
     try:
-        return str(yaml.safe_load(text)['name'])
-    except (yaml.YAMLError, KeyError, TypeError):
+        return str(load_yaml(text, 'machine')['name'])
+    except (UserError, KeyError, TypeError):
         return 'recorded, without a name'
 
 

@@ -16,6 +16,7 @@ from rtest_drivers import cli
 from rtest_drivers.commands import session
 from rtest_drivers.commands.identify import _found, _missing, default_output, recording_name
 from rtest_drivers.config import config_path
+from rtest_drivers.domain import free_domain
 from rtest_drivers.folders import writing
 from rtest_drivers.runner import NodeFailed
 from rtest_estimation.errors import UserError
@@ -263,3 +264,12 @@ def test_the_demo_measures_the_cycle_of_the_thesis():
     # 7 B x 12 C, and B = C = 0 before and after.
     assert [len(plan.commands) for plan in static] == [86] * 4
     assert json.dumps(config.sphere_radius) == '0.0127'
+
+
+def test_asking_where_no_session_runs(capsys, monkeypatch):
+    pytest.importorskip('rclpy')
+    monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+    assert cli.main(['ask', 'skip', '--domain', str(free_domain())]) == 2
+    assert 'no session in ROS domain' in capsys.readouterr().err
+    assert cli.main(['ask', 'skip', '--domain', '400']) == 2
+    assert 'expected a number from 0 to 232' in capsys.readouterr().err

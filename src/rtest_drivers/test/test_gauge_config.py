@@ -41,7 +41,7 @@ def test_a_full_file(tmp_path) -> None:
     # What the file does not say is the factory setting.
     assert display.line == Line(9600, 7, 'even', 2)
     assert (display.signs, display.limits) == ((1,), None)
-    assert (laser.scale, display.scale) == (1e-3, 0.0254)
+    assert laser.physical(1, 0.25) == (-0.25e-3, '') and display.physical(0, 2.0) == (0.0508, '')
 
 
 def test_every_protocol_can_be_named(tmp_path) -> None:

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from bisect import bisect_left
-
 import numpy as np
 
 from rtest_estimation.buffers import FeedbackBuffer
 from rtest_estimation.dwell import ROTARY_LETTERS, DwellRules, find_dwells, trailing
-from rtest_estimation.records import CyclePlan, Feedback, Kind
+from rtest_estimation.records import CyclePlan, Kind
 
 # Arrival is seen before the axes stand still; this covers the difference [s].
 ARRIVAL = 0.5
@@ -41,25 +39,25 @@ class CycleEnd:
         """
         if self._end is not None:
             return self._end
-        rotary = [axis in ROTARY_LETTERS for axis in plan.axes]
-        near = [self.rules.near[turns] for turns in rotary]
-        last = plan.commands[-1]
-        start = bisect_left(feedback.stamps, max(self._seen + 1, plan.stamp))
-        for sample in feedback.samples[start:]:
-            if limit is not None and sample.stamp >= limit:
+        stamps, positions = feedback.since(max(self._seen + 1, plan.stamp), plan.axes)
+        near = np.array([self.rules.near[axis in ROTARY_LETTERS] for axis in plan.axes])
+        # What the feedback does not have is taken to be there.
+        absent = np.array([not feedback.has(axis) for axis in plan.axes])
+        there_at = ((np.abs(positions - plan.commands[-1]) <= near) | absent).all(axis=1)
+        for stamp, there in zip(stamps.tolist(), there_at.tolist(), strict=True):
+            if limit is not None and stamp >= limit:
                 return limit
-            self._seen = sample.stamp
-            there = _there(plan.axes, sample, last, near)
+            self._seen = stamp
             if self._since is None:
-                self._since = sample.stamp if there else None
+                self._since = stamp if there else None
                 continue
             dwell = trailing(plan) * plan.dwell
             stood = (dwell + ARRIVAL if there else 0.5 * dwell) * 1e9
             since, self._since = self._since, self._since if there else None
-            if sample.stamp - since < stood or self._tried == since:
+            if stamp - since < stood or self._tried == since:
                 continue
             self._tried = since
-            end = since + int(stood) if there else sample.stamp
+            end = since + int(stood) if there else stamp
             if self._done(plan, *feedback.window(plan, begin, end)):
                 self._end = end
                 return end
@@ -91,12 +89,3 @@ def arrivals(plan: CyclePlan, positions: np.ndarray, rules: DwellRules) -> list[
             break
         found.append(first + int(np.argmax(there)))
     return found
-
-
-def _there(axes: tuple[str, ...], sample: Feedback, last: np.ndarray, near: list[float]) -> bool:
-    """Whether a sample is at the last pose."""
-    for axis, command, tolerance in zip(axes, last, near, strict=True):
-        off = axis in sample.axes and abs(sample.position[sample.axes.index(axis)] - command)
-        if off is not False and not off <= tolerance:
-            return False
-    return True

@@ -88,7 +88,9 @@ def temperature(message: Any) -> Temperature:
         )
     if not np.isfinite(value):
         raise MessageError(f'Temperature of {sensor} is {value}')
-    return Temperature(nanoseconds(message.header.stamp), sensor, value)
+    return Temperature(
+        nanoseconds(message.header.stamp), sensor, value, float(message.variance)
+    )
 
 
 def cycle_plan(message: Any) -> CyclePlan:

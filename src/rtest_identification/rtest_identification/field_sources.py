@@ -60,8 +60,7 @@ def outer_cross(result: Identification) -> np.ndarray:
     first, second = result.location.gain, result.fit.error_map.gain
     both = np.concatenate([first, second])
     sources = sum(result.sources.carry(both).values())
-    noise = result.fit.rms**2 * np.einsum('pni,qni->pq', first, second)
-    return noise + sources[: len(first), len(first) :]
+    return result.fit.across + sources[: len(first), len(first) :]
 
 
 def grid_covariance(result: Identification) -> np.ndarray:

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from rtest_estimation.errors import UserError
+from rtest_estimation.yaml_text import load_yaml
 
 BED = 'bed'
 _KEYS = {'name', 'chain', 'axes', 'tool_mm'}
@@ -102,10 +102,7 @@ def parse_machine(text: str, where: str = 'machine') -> Machine:
 
     Raises UserError naming key and what is expected.
     """
-    try:
-        data = yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        raise UserError(f'{where}: not valid YAML: {" ".join(str(error).split())}') from None
+    data = load_yaml(text, where)
     if not isinstance(data, dict):
         raise UserError(f'{where}: expected a mapping with name, chain and axes')
     _only(data, _KEYS, where)

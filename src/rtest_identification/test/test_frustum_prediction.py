@@ -2,12 +2,14 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from independent import NMV, SETUPS, B, C, centre, nest_cycle, noisy, static_cycle
 
 from rtest_estimation.errors import UserError
+from rtest_estimation.recording import read_recording
 from rtest_identification.error_field import ErrorField
 from rtest_identification.field_maps import InnerMap, OuterMap
 from rtest_identification.field_sources import Sources
@@ -21,10 +23,12 @@ from rtest_identification.frustum.sources import of_field, of_sizes
 from rtest_identification.frustum.thesis import CASES, frustum
 from rtest_identification.gap.model_file import Model, ModelEffect, Value
 from rtest_identification.machine import parse_machine
+from rtest_identification.offline import estimate_recording
 from rtest_identification.output import as_dict
 from rtest_identification.pipeline import identify
 from rtest_identification.symbols import location_parameters, map_parameters
 
+BAGS = Path(__file__).resolve().parents[3] / 'bags'
 MACHINE = parse_machine(NMV)
 CONE = CASES['a']
 MADE = command(MACHINE, CONE.feature())
@@ -84,6 +88,24 @@ def test_the_map_explains_what_location_errors_do_not(found):
         np.abs(true.profile - found.form.profile) < 2.0 * found.profile_stddev
     ) > 0.9
     assert found.stddev < 0.2 * true.deviation
+
+
+def test_a_recorded_session_explains_it_too():
+    """Section 6.6: the bag's cell has Table 6-8 and the coning, made by the simulated cell."""
+    recording = read_recording(BAGS / 'coning')
+    cycles = [one.cycle for one in estimate_recording(recording)]
+    session = identify(MACHINE, cycles)
+    assert not session.missing
+    found = predict_form(MADE, of_field(MADE, ErrorField.from_identification(session)), CONE)
+    true = form(MADE, true_error(MADE, coning), CONE)
+    assert found.constant.deviation < 0.4 * true.deviation
+    left = [rms(true.profile - one.profile) for one in (found.form, found.constant)]
+    assert left[0] < 0.4 * left[1]
+    assert abs(found.form.deviation - true.deviation) < 2.0 * found.stddev
+    assert np.mean(
+        np.abs(true.profile - found.form.profile) < 2.0 * found.profile_stddev
+    ) > 0.9
+    assert 'most of it tilt of C' in diagnosis(found)
 
 
 def test_the_tilt_of_c_is_named(found):

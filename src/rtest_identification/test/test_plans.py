@@ -10,7 +10,7 @@ from rtest_identification.error_map import STATION, stations
 from rtest_identification.kinematics import predict
 from rtest_identification.machine import parse_machine
 from rtest_identification.moves import synchronous_path
-from rtest_identification.plans import OVERRUN, UNEVEN_DEG, diagnostic, static
+from rtest_identification.plans import OVERRUN, UNEVEN_DEG, diagnostic, program_name, static
 from rtest_identification.session_file import load_session
 
 MACHINE = parse_machine(NMV)
@@ -121,6 +121,43 @@ def test_a_diagnostic_cycle_takes_uneven_stations_unless_the_file_gives_its_own(
     changed = load_session(session(tmp_path), 'diagnostic')
     np.testing.assert_allclose(np.degrees(changed.stations[1]), UNEVEN_DEG)
     assert changed.plans[-1].cycle == '1a-diagnostic'
+
+
+THERMAL = SESSION.replace('cycle: {', 'cycle: {kind: thermal, every_min: 0.7, hours: 0.035, ')
+
+
+def test_a_thermal_session_repeats_one_static_cycle(tmp_path):
+    config = load_session(session(tmp_path, THERMAL))
+    # 2.1 min hold three intervals of 0.7 min, which binary fractions do not know.
+    names = [f'1a-thermal-{number:02d}' for number in range(1, 5)]
+    assert [plan.cycle for plan in config.plans] == ['1a-nest', *names]
+    assert (config.every, config.repetitions) == (pytest.approx(42.0), 4)
+    assert [plan.cycle for plan in config.distinct] == ['1a-nest', '1a-thermal-01']
+    once = load_session(session(tmp_path)).plans[-1]
+    for plan in config.plans[1:]:
+        assert plan.kind is once.kind
+        np.testing.assert_array_equal(plan.commands, once.commands)
+    assert [program_name(name) for name in (*names, '1a-static', '1a-thermal')] == [
+        *['1a-thermal'] * 4, '1a-static', '1a-thermal',
+    ]
+
+
+@pytest.mark.parametrize(
+    ('old', 'new', 'words'),
+    [
+        (' hours: 0.035,', '', 'cycle: hours: missing'),
+        ('every_min: 0.7', 'every_min: 0', 'cycle: every_min: expected 0.1 to 1440'),
+        ('every_min: 0.7', 'every_min: 3', '0.035 h with a cycle every 3 min are 1 cycles'),
+        ('hours: 0.035', 'hours: 300', 'are 25715 cycles; expected 2 to 2000'),
+        ('kind: thermal', 'kind: static', 'every_min: expected with kind: thermal only'),
+        ('setups:', 'setups:\n  2a: {sphere_mm: [0, -60, 40]}', 'setups: expected one, which'),
+    ],
+)
+def test_mistakes_in_a_thermal_session_are_told_in_one_line(tmp_path, old, new, words):
+    assert old in THERMAL
+    with pytest.raises(UserError) as caught:
+        load_session(session(tmp_path, THERMAL.replace(old, new, 1)))
+    assert words in str(caught.value) and '\n' not in str(caught.value)
 
 
 def test_speeds_approach_table_and_spindle_are_read(tmp_path):

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
-
-import yaml
 
 from rtest_drivers.cnc.axes import LENGTHS, UNITS, AxisSource
 from rtest_estimation.dwell import ROTARY_LETTERS
 from rtest_estimation.errors import UserError
+from rtest_estimation.yaml_text import read_yaml
 from rtest_identification.session_reader import Reader
 
 
@@ -77,12 +75,7 @@ def load(path: str, known: set[str]) -> DeviceReader:
 
     Raises UserError naming file, key and what is expected.
     """
-    try:
-        data = yaml.safe_load(Path(path).read_text(encoding='utf-8'))
-    except (OSError, UnicodeDecodeError) as error:
-        raise UserError(f'{path}: cannot read the device file: {error}') from None
-    except yaml.YAMLError as error:
-        raise UserError(f'{path}: not valid YAML: {" ".join(str(error).split())}') from None
+    data = read_yaml(path, 'the device file')
     if not isinstance(data, dict):
         raise UserError(f'{path}: expected a mapping of {sorted(known)}')
     reader = DeviceReader(path, data)

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from rtest_drivers.topics import add_topic_argument, chosen_topics
 from rtest_estimation.errors import UserError
 
 if TYPE_CHECKING:
@@ -44,9 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         help='effects of your own that the model has')
     parser.add_argument('--out', type=Path, metavar='DIR',
                         help='write to DIR, or to DIR/NAME of each of several recordings')
-    parser.add_argument('--topic', action='append', default=[], metavar='ROLE=NAME',
-                        help='where a recording has several topics of a type: the one that is '
-                        'meant, for example gauges=/cell_2/rtest/gauges; may be given often')
+    add_topic_argument(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -54,7 +53,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.trials and arguments.trials < MIN_TRIALS:
         raise UserError(f'--monte-carlo {arguments.trials}: expected {MIN_TRIALS} trials or more')
     options = Options(
-        arguments.machine, _topics(arguments.topic), arguments.tolerance, arguments.priors,
+        arguments.machine, chosen_topics(arguments.topic), arguments.tolerance, arguments.priors,
         arguments.model, arguments.trials, arguments.effects,
     )
     for bag, out in folders(arguments.bags, arguments.out, OUTPUT):
@@ -86,18 +85,6 @@ def folders(bags: Sequence[Path], out: Path | None, name: str) -> list[tuple[Pat
         taken[place] = bag
         found.append((bag, folder))
     return found
-
-
-def _topics(chosen: list[str]) -> dict[str, str]:
-    from rtest_estimation.recording import ROLES
-
-    topics = dict(text.partition('=')[::2] for text in chosen)
-    for role, name in topics.items():
-        if role not in ROLES or not name.startswith('/'):
-            raise UserError(
-                f'--topic {role}={name}: expected ROLE=/NAME with a role of {", ".join(ROLES)}'
-            )
-    return topics
 
 
 @dataclass(frozen=True)

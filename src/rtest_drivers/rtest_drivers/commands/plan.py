@@ -89,6 +89,8 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _told(checked: CheckedPlan) -> list[str]:
     """What a person wants to know before measuring."""
+    from rtest_identification.plans import program_name
+
     config, seen = checked.config, checked.foresight
     lines = [f'{config.machine.name}, {config.kind} cycle']
     if seen is not None:
@@ -98,11 +100,16 @@ def _told(checked: CheckedPlan) -> list[str]:
         )
     lines.append('')
     lines.append(f'{"cycle":20} {"poses":>5} {"blocks":>6} {"time":>9}')
-    for plan, path, check in zip(config.plans, checked.paths, checked.checks, strict=True):
+    for plan, path, check in zip(config.distinct, checked.paths, checked.checks, strict=True):
         near = f'  spindle {check.distance * 1e3:.1f} mm away' if check.distance else ''
         lines.append(
-            f'{plan.cycle:20} {len(plan.commands):5} {len(path.positions):6} '
+            f'{program_name(plan.cycle):20} {len(plan.commands):5} {len(path.positions):6} '
             f'{_time(check.duration):>9}{near}'
+        )
+    if config.every:
+        lines.append(
+            f'the last of them {config.repetitions} times, every {_time(config.every)}; what '
+            'follows is of one cycle'
         )
     lines += ['', *_ranges(checked)]
     if seen is not None:

@@ -116,9 +116,7 @@ def measure(
 
     # Mistakes in the files are told before anything is started.
     config = load_session(settings.config)
-    settings = replace(
-        settings, sphere_radius=config.sphere_radius, devices=config.devices
-    )
+    settings = settings.of(config)
     simulated = settings.simulate is not None
     if simulated:
         _check_truth(settings.simulate, config.plans)
@@ -144,20 +142,22 @@ def measure(
 def evaluate(settings: GraphSettings, complete: bool) -> Path:
     """Identify what a session has recorded, also where it is incomplete.
 
-    Returns the path of identification.json, or of dynamic.json where there is no static cycle.
-    Raises NodeFailed where something is missing.
+    Returns the path of identification.json, of thermal.json after a thermal session, of
+    dynamic.json where there is no static cycle. Raises NodeFailed where something is missing.
     """
     from rtest_drivers.commands import dynamic
     from rtest_drivers.commands.identify import identify
-    from rtest_estimation.records import Kind
-    from rtest_identification.session_file import load_session
+    from rtest_drivers.commands.thermal import evaluate as thermal
+    from rtest_identification.plans import turning
+    from rtest_identification.session_file import DYNAMIC, load_session
 
-    kinds = {plan.kind for plan in load_session(settings.config).plans}
+    config = load_session(settings.config)
     try:
-        if Kind.DYNAMIC in kinds:
+        if any(turning(config.machine, plan) for plan in config.plans):
             result = dynamic.evaluate(settings.folder)
-        if Kind.STATIC in kinds:
-            result = identify(settings.folder, quiet=True)
+        if config.kind != DYNAMIC:
+            evaluation = thermal if settings.thermal else identify
+            result = evaluation(settings.folder, quiet=True)
     except UserError as error:
         raise NodeFailed(f'{error}\n  recorded: {shown(settings.recording)}') from None
     if not complete:
@@ -171,8 +171,10 @@ def evaluate(settings: GraphSettings, complete: bool) -> Path:
 def _again(settings: GraphSettings) -> str:
     from rtest_identification.session_file import DYNAMIC, load_session
 
-    static = load_session(settings.config).kind != DYNAMIC
-    return f'rtest {"identify" if static else "dynamic"} {shlex.quote(shown(settings.folder))}'
+    command = 'thermal' if settings.thermal else 'identify'
+    if load_session(settings.config).kind == DYNAMIC:
+        command = 'dynamic'
+    return f'rtest {command} {shlex.quote(shown(settings.folder))}'
 
 
 def _check_truth(truth: Path, plans: Sequence[CyclePlan]) -> None:

@@ -5,6 +5,9 @@ file says `run_programs`. A cycle whose program ends before its last pose, as af
 measured anew. The services `session/repeat` and `session/skip` (std_srvs/Trigger) measure it anew
 at any time, or go on with the next one.
 
+The cycles of a thermal session begin at their times; one whose predecessor takes longer begins
+after it and is told to be late.
+
 Parameters
 ----------
 config : session file (YAML)
@@ -20,9 +23,10 @@ import math
 import re
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -41,7 +45,7 @@ from std_srvs.srv import Trigger
 from rtest_drivers.clock import HostClock
 from rtest_drivers.cnc.programs import program_of, start_program
 from rtest_drivers.graph import INCOMPLETE
-from rtest_drivers.schedule import NANOSECONDS, STOPPED_S, Progress, pose_count
+from rtest_drivers.schedule import NANOSECONDS, STOPPED_S, Progress, pose_count, turn
 from rtest_estimation.errors import UserError
 from rtest_estimation.missing import grouped
 from rtest_estimation.nodes import diagnostics, publish
@@ -55,11 +59,10 @@ from rtest_identification.session_file import (
 )
 
 DRIVERS = ('gauges', 'cnc')
+THERMOMETERS = 'thermometers'
 # Who must not miss the first reading.
 LISTENERS = ('recorder', 'estimator')
 STREAMS = ('rtest/gauges', 'rtest/cnc/feedback')
-# Closed in this order: what the earlier one publishes last, the later one still needs.
-FINISHERS = ('estimator', 'identifier', 'recorder')
 # Wall time a service may take [s]: an identification of a long session is the longest.
 SERVICE_TIMEOUT_S = 120.0
 # A subscription is seen in the graph a little before its publisher has matched it [s].
@@ -69,7 +72,7 @@ OTHERS_S = 3.0
 # How often progress is told: of a simulated cycle, of a real one [s].
 PROGRESS_S, SLOW_PROGRESS_S = 2.0, 10.0
 # Warnings of these nodes are told at the end, or are our own.
-QUIET = ('identifier', 'session')
+QUIET = ('identifier', 'thermal', 'session')
 # A simulated clock that stands still this long has lost its cell [s].
 CLOCK_TIMEOUT_S = 30.0
 # An NC program that has ended for so long has left its cycle: the estimator would have finished
@@ -105,6 +108,11 @@ class SessionNode(Node):
         config = self.declare_parameter('config', '').value
         self.config: SessionConfig = load_session(config)
         self._folder = Path(config).parent
+        more = (THERMOMETERS,) if self.config.reads_temperatures(self.simulated) else ()
+        self._drivers = (*DRIVERS, *more)
+        # Closed in this order: what the earlier one publishes last, the later one still needs.
+        identifier = 'thermal' if self.config.every else 'identifier'
+        self._finishers = ('estimator', identifier, 'recorder')
         # As the drivers' stamps, so that a clock that is set does not part plan and readings.
         self._host = HostClock()
 
@@ -115,10 +123,15 @@ class SessionNode(Node):
         self.create_subscription(NestCalibration, 'rtest/nest', self._on_nest, LATCHED)
         self.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, 100)
         self._change = {
-            name: self.create_client(ChangeState, f'{name}/change_state') for name in DRIVERS
+            name: self.create_client(ChangeState, f'{name}/change_state')
+            for name in self._drivers
         }
-        self._state = {name: self.create_client(GetState, f'{name}/get_state') for name in DRIVERS}
-        self._finish = {name: self.create_client(Trigger, f'{name}/finish') for name in FINISHERS}
+        self._state = {
+            name: self.create_client(GetState, f'{name}/get_state') for name in self._drivers
+        }
+        self._finish = {
+            name: self.create_client(Trigger, f'{name}/finish') for name in self._finishers
+        }
         for wish in (REPEAT, SKIP):
             self.create_service(Trigger, f'~/{wish}', partial(self._on_wish, wish))
 
@@ -135,7 +148,7 @@ class SessionNode(Node):
         self._problems: list[str] = []
         self._status = 'waiting for the other nodes'
         self._cycle_number = 0
-        self._wish = ''
+        self._wish, self._following = '', False
         # What each driver last said, and the state of the NC program: since when it has not run.
         self._said: dict[str, str] = {}
         self._heard = 0
@@ -151,26 +164,35 @@ class SessionNode(Node):
         """
         self._wait_for_nodes()
         self._machine.publish(String(data=self.config.machine.text))
-        for name in DRIVERS:
+        for name in self._drivers:
             self._bring_to(name, State.PRIMARY_STATE_INACTIVE)
         self._wait_for_listeners()
-        for name in DRIVERS:
+        for name in self._drivers:
             self._bring_to(name, State.PRIMARY_STATE_ACTIVE)
         if self.simulated:
             self._wait_for('/clock of the simulated cell', lambda: self._now() > 0)
         poses = sum(len(plan.commands) for plan in self.config.plans)
         self.say(f'{self.config.machine.name}: {len(self.config.plans)} cycles, {poses} poses')
         started = {}
+        # Of the repeated cycles: when each is to begin.
+        turns = self._turns()
         for number, plan in enumerate(self.config.plans, 1):
             self._cycle_number = number
+            due = next(turns) if self.config.every and plan.kind is Kind.STATIC else 0
             measure = self._measure if self.simulated else self._measure_on_machine
-            started[plan.cycle] = measure(plan)
+            started[plan.cycle] = measure(plan, due)
         self._status = 'finishing'
         self._close()
         self._judge(started)
         self._status = 'finished'
         self._diagnose()
         return self._problems
+
+    def _turns(self) -> Iterator[int]:
+        """Times at which repeated cycles begin [ns], from the first question on."""
+        start = self._now()
+        for number in count():
+            yield start + round(number * self.config.every * 1e9)
 
     def _wait_for_nodes(self) -> None:
         clients = {f'{name}/change_state': client for name, client in self._change.items()}
@@ -240,12 +262,25 @@ class SessionNode(Node):
         request = ChangeState.Request(transition=Transition(id=transition))
         return self._call(self._change[driver], request, f'{driver}/change_state').success
 
-    def _measure(self, plan: CyclePlan) -> list[tuple[str, int]]:
+    def _tell_turn(self, plan: CyclePlan, due: int) -> None:
+        """Say when a repeated cycle is to begin, or that it is late. due : [ns], 0 for at once."""
+        text, late = turn(due, self._now()) if due else ('', False)
+        if late:
+            self.get_logger().warning(f'{plan.cycle}: {text}')
+        if text:
+            self._status = f'waiting for {plan.cycle}'
+            self._say_cycle(plan, text)
+
+    def _measure(self, plan: CyclePlan, due: int) -> list[tuple[str, int]]:
         """Publish one plan and wait for its finished cycle; returns its key.
 
         Goes on where the cycle has stopped; it is then finished by the next plan or at the end.
+
+        due : when it is to begin [ns]. The plan is published at once: a simulated cell that knows
+            for how long it has nothing to do lets that time pass quickly
         """
-        key = self._start(plan)
+        self._tell_turn(plan, due)
+        key = self._start(plan, due)
         shown, told = time.monotonic(), 0
         progress = Progress(plan, key[1], shown, self.cycle_timeout)
         while key not in self._cycles:
@@ -258,6 +293,8 @@ class SessionNode(Node):
             if key in self._cycles:
                 break
             done, poses = self._progress(key)
+            if done:
+                self._status = f'measuring {plan.cycle}'
             if why := progress.stopped(now, wall, done, self._feedback_age):
                 self.get_logger().warning(f'{plan.cycle}: {why}')
                 self._say_cycle(plan, f'{why}; going on')
@@ -267,11 +304,17 @@ class SessionNode(Node):
                 self._say_cycle(plan, f'{done} of {poses} poses')
         return [key]
 
-    def _measure_on_machine(self, plan: CyclePlan) -> list[tuple[str, int]]:
+    def _measure_on_machine(self, plan: CyclePlan, due: int) -> list[tuple[str, int]]:
         """Measure a cycle whose NC program runs on a real machine; the keys of all attempts.
 
-        Waits as long as it takes until somebody starts the program.
+        Waits as long as it takes until somebody starts the program. due : when it is to begin [ns]
         """
+        self._tell_turn(plan, due)
+        self._wish = ''
+        while (left := (due - self._now()) / NANOSECONDS) > 0.0:
+            if self.wait(lambda: self._wish == SKIP, left):
+                self._say_cycle(plan, f'{SKIP}, as was asked for')
+                return []
         device = self.config.devices.get('cnc')
         by_hand = device is None or device.programs == BY_HAND
         keys = []
@@ -285,7 +328,9 @@ class SessionNode(Node):
             if by_hand:
                 self._say_cycle(plan, f'start {self._program_name(plan)}')
             by_hand = True
+            self._following = True
             again = self._follow(plan, keys[-1])
+            self._following = False
             if not again:
                 return keys
 
@@ -302,15 +347,15 @@ class SessionNode(Node):
             if ran and wall - self._ended > ENDED_S and key not in self._cycles:
                 self._say_cycle(
                     plan, f'{done} of {len(plan.commands)} poses, and the program has ended'
-                    f'{self._why()}; the cycle is measured anew, or call session/skip'
+                    f'{self._why()}; the cycle is measured anew, or `rtest ask skip`'
                 )
                 return True
             why = progress.stopped(self._now(), wall, done, self._feedback_age)
             if why and not complained:
                 self.get_logger().warning(f'{plan.cycle}: {why}')
                 self._say_cycle(
-                    plan, f'{why}{self._why()}; go on with the program, or call session/repeat to '
-                    'measure the cycle anew, session/skip to leave it'
+                    plan, f'{why}{self._why()}; go on with the program, or `rtest ask repeat` to '
+                    'measure the cycle anew, `rtest ask skip` to leave it'
                 )
             complained = bool(why)
             if wall - shown > SLOW_PROGRESS_S and told < done < poses:
@@ -320,11 +365,14 @@ class SessionNode(Node):
             self._say_cycle(plan, f'{self._wish}, as was asked for')
         return self._wish == REPEAT
 
-    def _start(self, plan: CyclePlan) -> tuple[str, int]:
-        """Publish a plan; returns the key of its cycle. The one before ends with it."""
-        stamp = self._now()
+    def _start(self, plan: CyclePlan, due: int = 0) -> tuple[str, int]:
+        """Publish a plan; returns the key of its cycle. The one before ends with it.
+
+        due : when the cycle begins [ns]; at once where that is past
+        """
+        stamp = max(self._now(), due)
         key = (plan.cycle, stamp)
-        self._status = f'measuring {plan.cycle}'
+        self._status = f'{"waiting for" if due > self._now() else "measuring"} {plan.cycle}'
         self._poses_done = self._feedback_age = None
         self._ran = False
         self._open[key] = plan
@@ -413,10 +461,10 @@ class SessionNode(Node):
             self._problem(f'incomplete: nothing was measured in {", ".join(lost)}')
 
     def _close(self) -> None:
-        for name in DRIVERS:
+        for name in self._drivers:
             if not self._transition(name, Transition.TRANSITION_DEACTIVATE):
                 self._problem(f'driver {name} could not be deactivated')
-        for name in FINISHERS:
+        for name in self._finishers:
             # Let the last messages of the one before arrive.
             self.wait(lambda: False, SETTLE_S)
             self._tell_finished()
@@ -512,7 +560,7 @@ class SessionNode(Node):
     def _note_driver(self, status: DiagnosticStatus, values: dict[str, str]) -> None:
         """What a driver says, and whether an NC program runs."""
         name = status.name.rpartition('/')[2].partition(':')[0]
-        if name not in DRIVERS:
+        if name not in self._drivers:
             return
         self._said[name] = '' if status.level == diagnostics.OK else status.message
         if name != 'cnc':
@@ -531,7 +579,12 @@ class SessionNode(Node):
     def _on_wish(
         self, wish: str, _: Trigger.Request, response: Trigger.Response
     ) -> Trigger.Response:
-        self._wish, response.success, response.message = wish, True, self._status
+        response.success, response.message = self._following, self._status
+        # Otherwise it would be remembered, and meet a cycle that nobody meant.
+        if self._following:
+            self._wish = wish
+        else:
+            response.message += '; there is nothing to repeat or skip'
         return response
 
     def _diagnose(self) -> None:

@@ -111,21 +111,26 @@ class Timeline:
         return self._legs[-1]
 
     def append(
-        self, start: int, target: np.ndarray, nest: int, offset: np.ndarray, speed: float = 0.0
+        self,
+        start: int,
+        target: np.ndarray,
+        nest: int,
+        offset: np.ndarray,
+        feed: float | None = None,
     ) -> Leg:
         """Go to `target` (k,) from wherever the last leg ends, leaving at `start` [ns].
 
-        speed : constant one of the rotary axis that turns farthest [rad/s]; 0 for a smooth move
+        feed : largest speed of a linear axis in place of that of the drives [m/s]; where a rotary
+            axis turns, its constant speed [rad/s]
         """
         last = self.last
         sphere = self._sphere(target)
-        ramp = 0.0
-        if speed:
-            travel = float(np.abs(target - last.end)[self._turning].max())
-            ramp = min(speed / self._drives.acceleration, travel / speed)
-            duration = travel / speed + ramp
+        travel, ramp = float(np.abs(target - last.end)[self._turning].max()), 0.0
+        if feed is not None and travel > 0.0:
+            ramp = min(feed / self._drives.acceleration, travel / feed)
+            duration = travel / feed + ramp
         else:
-            duration = self._duration(last.end, target, last.sphere_end, sphere)
+            duration = self._duration(last.end, target, last.sphere_end, sphere, feed)
         leg = Leg(
             start, duration, last.end, np.array(target, dtype=float), last.sphere_end, sphere,
             nest, last.offset_end, np.asarray(offset, dtype=float), ramp,
@@ -204,7 +209,12 @@ class Timeline:
         return sphere_in_table(self._machine, positions[None, :letters])[0]
 
     def _duration(
-        self, begin: np.ndarray, end: np.ndarray, sphere: np.ndarray, sphere_end: np.ndarray
+        self,
+        begin: np.ndarray,
+        end: np.ndarray,
+        sphere: np.ndarray,
+        sphere_end: np.ndarray,
+        feed: float | None,
     ) -> float:
         if np.abs(end - begin).max() < 1e-12:
             return 0.0
@@ -216,7 +226,7 @@ class Timeline:
         )
         slope = np.abs(np.diff(path, axis=0)).max(axis=0) * (len(share) - 1)
         limit = np.full(len(self.axes), self._drives.rotary)
-        limit[self._linear] = self._drives.linear
+        limit[self._linear] = self._drives.linear if feed is None else feed
         wanted = max(self._drives.shortest, float((slope / limit).max()) * _PEAK)
         # Whole microseconds: stamps are integers, and a leg must not end between two of them.
         return math.ceil(wanted * 1e6) * 1e-6

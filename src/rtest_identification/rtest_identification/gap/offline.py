@@ -65,7 +65,7 @@ def gap_recording(
         model.free(machine)  # Raises where it lists an error that the machine does not have.
     recording = recording_of(bag)
     finished = estimate_recording(recording, None, progress)
-    directions = {f.nest.setup: f.nest.direction for f in finished if f.nest is not None}
+    directions = {f.nest.setup: f.nest.sensitive for f in finished if f.nest is not None}
     progress('comparing model and measurement')
     session = gap_session(machine, [f.cycle for f in finished], directions, model, more)
     known = library(session.result.rows.scene)
