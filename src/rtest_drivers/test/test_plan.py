@@ -91,7 +91,8 @@ def test_a_thermal_session_has_one_program_for_all_its_cycles(capsys, tmp_path):
     )
     assert status == 0 and not err
     assert '13 times, every 15 min' in out
-    assert 'thermal plan, 27 poses, 3 h 0' in out.splitlines()[-1]
+    assert 'thermal plan, 27 poses, ' in out.splitlines()[-1]
+    assert ', 3 h 05 min, ' in out.splitlines()[-1]
     assert sorted(path.name for path in out_dir.glob('*.ngc')) == [
         'low-nest.ngc', 'low-runout.ngc', 'low-thermal.ngc',
     ]

@@ -374,7 +374,8 @@ def test_friction_shows_in_the_readings_and_not_in_the_feedback() -> None:
     [
         ({'axes': ('X', 'Y', 'Z', 'B', 'A')}, 'no axis A'),
         ({'commands': np.full((1, 5), 0.3)}, 'pose 0: X = 0.3 is outside'),
-        ({'kind': Kind.DYNAMIC}, 'needs a feed'),
+        ({'kind': Kind.DYNAMIC}, 'turns a rotary axis between all of its poses, with a feed'),
+        ({'kind': Kind.DYNAMIC, 'commands': np.zeros((2, 5))}, 'has a feed'),
     ],
 )
 def test_impossible_plans_are_refused(changes: dict, expected: str) -> None:

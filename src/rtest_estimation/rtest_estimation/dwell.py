@@ -8,12 +8,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rtest_estimation.records import CyclePlan, Missing
+from rtest_estimation.records import CyclePlan, Kind, Missing
 
 # ISO 841 letters of rotary axes, and S, the spindle angle of a plan. Only tolerances depend on it.
 ROTARY_LETTERS = frozenset('ABCS')
 # Six standard deviations of normal noise, in median absolute deviations.
 _ENDS = 6 * 1.4826
+
+
+def turns(plan: CyclePlan) -> bool:
+    """Whether it is a dynamic cycle in which a rotary axis or the spindle turns."""
+    columns = [column for column, axis in enumerate(plan.axes) if axis in ROTARY_LETTERS]
+    return plan.kind is Kind.DYNAMIC and bool(np.ptp(plan.commands[:, columns], axis=0).any())
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,9 @@ MIN_POSITIONS = 8
 # A contact gauge shows what the sphere moves along it. What is further off is no gain of a gauge
 # but a wrong unit or decimal point, or a gauge that does not touch.
 _GAIN = (0.8, 1.25)
-# A gauge in its range that touches and is fixed follows the steps better than this share of them.
-_MISFIT = 0.01
+# A gauge in its range that touches and is fixed follows the steps better than this share of them;
+# a ball as its tip rolls over the sphere and leaves some hundredths.
+_MISFIT = 0.1
 # What a wrong setting would make of a gain of one.
 _FACTORS = {
     25.4: 'inch instead of mm', 1 / 25.4: 'mm instead of inch', 1000.0: 'mm instead of um',

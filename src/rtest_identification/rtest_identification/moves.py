@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from rtest_estimation.dwell import turns
 from rtest_estimation.errors import UserError
 from rtest_estimation.records import CyclePlan
 from rtest_identification.kinematics import linear_positions, predict
 from rtest_identification.machine import Machine
-from rtest_identification.plans import turning
 
 # How far the sphere may be from its place in the nest while the axes move [m].
 ARC_TOLERANCE = 5e-5
@@ -91,12 +91,12 @@ def synchronous_path(
     The rotary axes go straight to their ends and the linear ones so that the sphere goes straight,
     as seen from the table, from one nominal place to the next, which is the same one in a static
     cycle. There are as many pieces as it takes to keep the sphere within `tolerance` [m] of that.
-    Each takes as long as its slowest axis, and no shorter than the plan's feed allows where only
-    linear axes move; in a dynamic cycle that turns a rotary axis, as that takes at the feed.
+    Each takes as long as its slowest axis; in a dynamic cycle, as its rotary axis at the feed, and
+    no shorter than the feed allows where only linear axes move.
     """
     speeds, fewest, most = speeds or Speeds(), 1, math.inf
-    turns = turning(machine, plan)
-    if turns:
+    turning = turns(plan)
+    if turning:
         speeds, tolerance = Speeds(math.inf, plan.feed), min(tolerance, _DYNAMIC_TOLERANCE)
     count = len(machine.letters)
     if plan.axes[:count] != machine.letters:
@@ -108,7 +108,7 @@ def synchronous_path(
     rows, poses = [plan.commands[:1]], [np.zeros(1, dtype=int)]
     for number in range(1, len(plan.commands)):
         pair = slice(number - 1, number + 1)
-        if turns:
+        if turning:
             travel = np.abs(np.diff(plan.commands[pair], axis=0)).max()
             fewest = math.ceil(travel / _PIECE)
             most = max(fewest, math.floor(travel / (plan.feed * _SHORTEST)))
@@ -120,7 +120,7 @@ def synchronous_path(
     limit = np.where(rotary, speeds.rotary, speeds.linear)
     steps = np.diff(positions, axis=0)
     time = np.maximum((np.abs(steps) / limit).max(axis=1), _SHORTEST)
-    if plan.feed > 0.0 and not steps[:, rotary].any():
+    if plan.feed > 0.0 and not turning:
         time = np.maximum(time, np.linalg.norm(steps, axis=1) / plan.feed)
     return AxisPath(positions, np.concatenate(poses), np.r_[0.0, time])
 

@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+from rtest_estimation.dwell import turns
 from rtest_estimation.errors import UserError
 from rtest_estimation.records import CyclePlan
 from rtest_identification.kinematics import predict
@@ -27,7 +28,7 @@ from rtest_identification.machine import Machine
 from rtest_identification.moves import ARC_TOLERANCE, Approach, AxisPath, clear_of_nest
 from rtest_identification.nc_controllers import CONTROLLERS
 from rtest_identification.plan_check import duration
-from rtest_identification.plans import DYNAMIC_REST, SPINDLE, turning
+from rtest_identification.plans import DYNAMIC_REST, SPINDLE
 
 # 0.1 um and 1e-5 deg: the latter moves the sphere by 0.02 um at 100 mm.
 LINEAR_DIGITS, ROTARY_DIGITS = 4, 5
@@ -136,8 +137,7 @@ def _header(
     sphere_radius: float | None,
 ) -> list[str]:
     controller = CONTROLLERS[settings.controller]
-    minutes = duration(plan, path, approach) / 60.0
-    dwell = DYNAMIC_REST if turning(machine, plan) else plan.dwell
+    minutes, dwell = duration(plan, path, approach) / 60.0, plan.dwell or DYNAMIC_REST
     x, y, z = np.asarray(plan.sphere) * 1e3
     at_zero = machine.tool * 1e3
     said = [
@@ -244,10 +244,9 @@ def _poses(
                 lines.append(f'M19 R{round(angle, 3) % 360.0:.3f}')
             # No message: LinuxCNC keeps some twenty for a screen to fetch, and where there is none
             # each further one holds the program, and what it tells of itself, for 5 s.
-            dwell = DYNAMIC_REST if turning(writer.machine, plan) else plan.dwell
             lines.append(f'(POSE {pose})')
-            if dwell > 0.0:
-                lines.append(controller.dwell(dwell))
+            if rest := plan.dwell or (DYNAMIC_REST if turns(plan) else 0.0):
+                lines.append(controller.dwell(rest))
             if settings.pause:
                 lines.append('M0')
     return lines

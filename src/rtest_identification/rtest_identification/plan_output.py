@@ -188,7 +188,7 @@ def _session(config: SessionConfig) -> str:
     """The session file with the cycle as it was planned, beside its machine file."""
     data = config.data | {'machine': 'machine.yaml'}
     if config.kind != DYNAMIC:
-        cycle = dict(config.data['cycle']) | {'kind': config.kind}
+        cycle = dict(config.data.get('cycle', {})) | {'kind': config.kind}
         for name, stations in zip(config.machine.rotary, config.stations, strict=True):
             degrees = np.degrees(stations).tolist()
             cycle[f'{name.lower()}_deg'] = [round(v, 9) + 0.0 for v in degrees]
@@ -211,6 +211,8 @@ def _as_dict(checked: CheckedPlan, session: str) -> dict[str, Any]:
         'session': session,
         'machine': config.machine.name,
         'kind': config.kind,
+        'repeated': {'every': config.every, 'cycles': config.repetitions}
+        if config.every else None,
         'duration': checked.duration,
         'not_checked': checked.unchecked,
         'warnings': list(checked.warnings),
@@ -220,8 +222,6 @@ def _as_dict(checked: CheckedPlan, session: str) -> dict[str, Any]:
     rotary = [p.axis in config.machine.rotary for p in seen.location.parameters]
     maps = [m for m in (seen.outer_map, seen.inner_map) if m is not None]
     return common | {
-        'repeated': {'every': config.every, 'cycles': config.repetitions}
-        if config.every else None,
         'stations': {
             name: values.tolist()
             for name, values in zip(config.machine.rotary, config.stations, strict=True)

@@ -25,10 +25,10 @@ UNEVEN_DEG = (0, 50, 60, 80, 110, 145, 160, 200, 240, 270, 315, 335)
 # How far an outermost level is overrun before it is approached from outside: more than any
 # backlash and enough to be a pose of its own, less than what counts as another station [rad].
 OVERRUN = math.radians(0.05)
+_REPEATED = re.compile(r'(.*-thermal)-\d+')
 # A dynamic cycle rests so long where it turns round: the readings have settled, and the end of the
 # cycle is seen by half of it [s].
 DYNAMIC_REST = 1.0
-_REPEATED = re.compile(r'(.*-thermal)-\d+')
 
 
 def nest_calibration(
@@ -243,12 +243,6 @@ def _plan(
         0, '', f'{setup}-{suffix}', kind, setup, np.asarray(sphere, dtype=float),
         machine.letters, np.array(commands, dtype=float), dwell, feed,
     )
-
-
-def turning(machine: Machine, plan: CyclePlan) -> bool:
-    """Whether a dynamic cycle turns a rotary axis; others scan the sphere."""
-    columns = [plan.axes.index(name) for name in machine.rotary if name in plan.axes]
-    return plan.kind is Kind.DYNAMIC and bool(np.ptp(plan.commands[:, columns], axis=0).any())
 
 
 def check_ranges(machine: Machine, plan: CyclePlan) -> None:

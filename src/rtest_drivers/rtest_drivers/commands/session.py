@@ -142,22 +142,21 @@ def measure(
 def evaluate(settings: GraphSettings, complete: bool) -> Path:
     """Identify what a session has recorded, also where it is incomplete.
 
-    Returns the path of identification.json, of thermal.json after a thermal session, of
+    Returns the path of identification.json, or of thermal.json after a thermal session, or of
     dynamic.json where there is no static cycle. Raises NodeFailed where something is missing.
     """
     from rtest_drivers.commands import dynamic
     from rtest_drivers.commands.identify import identify
     from rtest_drivers.commands.thermal import evaluate as thermal
-    from rtest_identification.plans import turning
-    from rtest_identification.session_file import DYNAMIC, load_session
+    from rtest_estimation.records import Kind
+    from rtest_identification.session_file import load_session
 
-    config = load_session(settings.config)
+    kinds = {plan.kind for plan in load_session(settings.config).plans}
     try:
-        if any(turning(config.machine, plan) for plan in config.plans):
+        if Kind.DYNAMIC in kinds:
             result = dynamic.evaluate(settings.folder)
-        if config.kind != DYNAMIC:
-            evaluation = thermal if settings.thermal else identify
-            result = evaluation(settings.folder, quiet=True)
+        if Kind.STATIC in kinds:
+            result = (thermal if settings.thermal else identify)(settings.folder, quiet=True)
     except UserError as error:
         raise NodeFailed(f'{error}\n  recorded: {shown(settings.recording)}') from None
     if not complete:

@@ -19,6 +19,7 @@ from rtest_drivers.sim.kinematics import sphere_in_table, table_to_spindle, turn
 from rtest_drivers.sim.motion import SPINDLE, Timeline
 from rtest_drivers.sim.truth import Truth
 from rtest_drivers.sim.warming import WarmErrors
+from rtest_estimation.dwell import turns
 from rtest_estimation.errors import UserError
 from rtest_estimation.records import (
     CyclePlan,
@@ -33,8 +34,8 @@ _READINGS, _OUTLIERS, _ENCODERS, _THERMOMETERS = 1, 2, 3, 4
 # Around a cycle everything is read as usual for so long: the end of one and the start of the next
 # are seen in the readings [ns].
 _NEAR_NS = 5_000_000_000
-# A rotary axis rests so long wherever a dynamic cycle turns it round; half the time over which
-# speeds are differences [ns].
+# A dynamic cycle rests so long wherever it turns round; half the time over which speeds are
+# differences [ns].
 _REST, _HALF_SPAN = 1_000_000_000, 1_000_000
 # From and to [ns].
 Wait = tuple[int, int] | None
@@ -173,11 +174,9 @@ class Cell:
             for fault in self.truth.faults
             if fault.kind == 'pose_skipped' and fault.cycle == plan.cycle
         }
-        columns = [self.axes.index(name) for name in plan.axes]
-        machine = self.truth.machine
-        rotary = [k for k, name in enumerate(plan.axes) if name in machine.rotary]
-        turning = plan.kind is Kind.DYNAMIC and np.ptp(plan.commands[:, rotary], axis=0).any()
+        turning = turns(plan)
         dwell = _REST if turning else round(plan.dwell * 1e9)
+        columns = [self.axes.index(name) for name in plan.axes]
         poses: dict[int, tuple[int, int]] = {}
         clock = start
         for pose, row in enumerate(plan.commands):
@@ -190,8 +189,7 @@ class Cell:
             # Nothing settles anew where a dynamic cycle turns round.
             name = plan.cycle if turning else f'{plan.cycle}/{pose}'
             offset = self.truth.gauges.dwell_noise * self._named(name).standard_normal(3)
-            # A dynamic cycle goes at its feed from pose to pose; linear axes without a stop.
-            feed = plan.feed if plan.kind is Kind.DYNAMIC and pose else None
+            speed = plan.feed if plan.kind is Kind.DYNAMIC and poses else 0.0
             if plan.setup != self._setup:
                 self._setup = plan.setup
                 leg = self._timeline.append(clock, target, -1, offset)
@@ -200,7 +198,7 @@ class Cell:
                 self._timeline.rest(clock, len(self._nests) - 1, offset)
             else:
                 clock = self._timeline.append(
-                    clock, target, len(self._nests) - 1, offset, feed
+                    clock, target, len(self._nests) - 1, offset, speed, turning
                 ).arrival
             poses[pose] = (clock, clock + dwell)
             clock += dwell
@@ -405,8 +403,16 @@ def check(plan: CyclePlan, truth: Truth) -> None:
     """
     where = f'plan {plan.cycle!r}'
     axes = truth.machine.axes
-    if plan.kind is Kind.DYNAMIC and not plan.feed > 0.0:
-        raise UserError(f'{where}: a dynamic cycle needs a feed')
+    if turns(plan):
+        turned = [k for k, name in enumerate(plan.axes) if name in axes and axes[name].rotary]
+        steps = np.abs(np.diff(plan.commands[:, turned], axis=0))
+        if not plan.feed > 0.0 or steps.max(axis=1).min() < 1e-9:
+            raise UserError(
+                f'{where}: a dynamic cycle turns a rotary axis between all of its poses, with a '
+                'feed, or none between any'
+            )
+    elif plan.kind is Kind.DYNAMIC and not plan.feed > 0.0:
+        raise UserError(f'{where}: a dynamic cycle has a feed')
     for column, name in enumerate(plan.axes):
         if name == SPINDLE:
             continue

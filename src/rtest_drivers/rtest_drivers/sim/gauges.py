@@ -40,11 +40,11 @@ class GaugeData:
     dwell_noise : of the sphere, once per dwell in each direction [m]
     lower, upper : range [m]; period : between readings [ns]; batch : readings in a message
     outliers, outlier : share of readings, standard deviation [m]
+    laser : None for contact gauges; noise and range are then the sensor's, and a mounting has
+        `position_error` no more
     late : by how much the stamps are later than the encoders' [s]
     friction : how far touching probes trail the motion at `friction_speed` [m], [m/s], and with
         which power of the speed that grows
-    laser : None for contact gauges; noise and range are then the sensor's, and a mounting has
-        `position_error` no more
     """
 
     azimuth: np.ndarray

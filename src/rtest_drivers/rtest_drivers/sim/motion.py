@@ -116,21 +116,23 @@ class Timeline:
         target: np.ndarray,
         nest: int,
         offset: np.ndarray,
-        feed: float | None = None,
+        speed: float = 0.0,
+        turning: bool = False,
     ) -> Leg:
         """Go to `target` (k,) from wherever the last leg ends, leaving at `start` [ns].
 
-        feed : largest speed of a linear axis in place of that of the drives [m/s]; where a rotary
-            axis turns, its constant speed [rad/s]
+        speed : 0 for as fast as the drives do. Otherwise the constant one of the rotary axis that
+            turns farthest [rad/s] where it is `turning`, else the largest of a linear axis [m/s]
         """
         last = self.last
         sphere = self._sphere(target)
-        travel, ramp = float(np.abs(target - last.end)[self._turning].max()), 0.0
-        if feed is not None and travel > 0.0:
-            ramp = min(feed / self._drives.acceleration, travel / feed)
-            duration = travel / feed + ramp
+        ramp = 0.0
+        if speed and turning:
+            travel = float(np.abs(target - last.end)[self._turning].max())
+            ramp = min(speed / self._drives.acceleration, travel / speed)
+            duration = travel / speed + ramp
         else:
-            duration = self._duration(last.end, target, last.sphere_end, sphere, feed)
+            duration = self._duration(last.end, target, last.sphere_end, sphere, speed or None)
         leg = Leg(
             start, duration, last.end, np.array(target, dtype=float), last.sphere_end, sphere,
             nest, last.offset_end, np.asarray(offset, dtype=float), ramp,

@@ -17,12 +17,11 @@ from rtest_estimation.errors import UserError
 from rtest_estimation.laser.solver import CentreSolver, CentreStatus
 from rtest_estimation.pipeline import Finished
 from rtest_estimation.recording import TYPES, Recording, recording_of
-from rtest_estimation.records import NestCalibration, NestKind, Status
+from rtest_estimation.records import Kind, NestCalibration, NestKind, Status
 from rtest_identification.dynamic.motion import Readings
 from rtest_identification.dynamic.pipeline import DynamicResult, analyse
 from rtest_identification.machine import Machine
 from rtest_identification.offline import estimate_recording, machine_of
-from rtest_identification.plans import turning
 
 
 @dataclass(frozen=True)
@@ -67,15 +66,15 @@ def dynamic_session(
 
     Raises UserError where there is no dynamic cycle, or none with a calibrated nest.
     """
-    cycles = [f.cycle for f in finished if turning(machine, f.cycle.plan)]
+    cycles = [f.cycle for f in finished if f.cycle.plan.kind is Kind.DYNAMIC]
     if not cycles:
         raise UserError('no dynamic cycle in this session; `rtest identify` evaluates static ones')
     nest_of = {f.nest.setup: f.nest for f in finished if f.nest is not None}
     gauges, feedback = GaugeBuffer(), FeedbackBuffer()
-    for block in recording.gauges.pieces():
+    for block in recording.gauges:
         gauges.append(block)
-    for piece in recording.feedback.pieces():
-        feedback.extend(piece.axes, piece.stamps, piece.positions)
+    for sample in recording.feedback:
+        feedback.append(sample)
     start = min(plan.stamp for plan in recording.plans)
     by_setup: dict[str, list[Readings]] = {}
     warnings = list(recording.warnings)

@@ -215,10 +215,10 @@ def _on_lines(
     """Stamps (n,), readings and status (n, lasers), positions (n, 3) on the lines of a scan."""
     plan, end = finished.cycle.plan, finished.cycle.stamp
     gauges, feedback = GaugeBuffer(), FeedbackBuffer()
-    for block in recording.gauges.pieces():
+    for block in recording.gauges:
         gauges.append(block)
-    for piece in recording.feedback.pieces():
-        feedback.extend(piece.axes, piece.stamps, piece.positions)
+    for sample in recording.feedback:
+        feedback.append(sample)
     times, displacement, status = gauges.window(plan.stamp, end)
     stamps, rows = feedback.window(plan, plan.stamp, end)
     if len(stamps) < 2 or not len(times):
