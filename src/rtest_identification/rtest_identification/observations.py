@@ -85,6 +85,11 @@ def stack(machine: Machine, cycles: Sequence[Cycle]) -> Observations:
     Raises UserError where a cycle's axes are not the machine's, or nothing was measured.
     """
     static = [cycle for cycle in cycles if turns(machine, cycle.plan) and cycle.points]
+    if not static and any(cycle.plan.kind is Kind.DYNAMIC for cycle in cycles):
+        raise UserError(
+            'no static cycle with a valid point in this session; `rtest dynamic` evaluates its '
+            'dynamic cycles'
+        )
     if not static:
         raise UserError(
             'no static cycle with a valid point in this session; '

@@ -55,9 +55,11 @@ def estimate_recording(
     def note(ready: Finished) -> None:
         done.append(ready)
         cycle = ready.cycle
+        poses = f'{len(cycle.points)} of {len(cycle.plan.commands)} poses'
+        if cycle.plan.kind is Kind.DYNAMIC:
+            poses = 'read while the axes move'
         progress(
-            f'{cycle.plan.cycle}: {len(cycle.points)} of {len(cycle.plan.commands)} poses'
-            + (f' ({ready.problem})' if ready.problem else '')
+            f'{cycle.plan.cycle}: {poses}' + (f' ({ready.problem})' if ready.problem else '')
         )
 
     for plan in recording.plans:

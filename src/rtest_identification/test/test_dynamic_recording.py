@@ -9,11 +9,11 @@ import pytest
 from dynamic_machine import FAST, SLOW, SPHERE, Hidden, measurement
 from independent import LETTERS, NMV
 
+from rtest_estimation.columns import FeedbackColumns
 from rtest_estimation.errors import UserError
 from rtest_estimation.recording import Recording
 from rtest_estimation.records import (
     CyclePlan,
-    Feedback,
     GaugeBlock,
     Kind,
     NestCalibration,
@@ -56,6 +56,14 @@ def nest_calibration(stamp):
     return plan, times, path, (path[:, :3] - SPHERE)
 
 
+class Held(list):
+    """Columns in memory in place of a topic of a file."""
+
+    def pieces(self):
+        """As `columns.Stream` gives them."""
+        return iter(self)
+
+
 def session(hidden, feeds):
     rng = np.random.default_rng(3)
     plan, times, path, displacement = nest_calibration(T0)
@@ -87,10 +95,15 @@ def session(hidden, feeds):
                 np.zeros(part.shape, np.uint8),
             ))
             sequence += len(part)
-    samples = tuple(Feedback(t, LETTERS, row) for t, row in feedback)
+    stamps, positions = (np.array(column) for column in zip(*feedback, strict=True))
+    # Of a second at most.
+    pieces = [
+        FeedbackColumns(LETTERS, stamps[k : k + BATCH], positions[k : k + BATCH])
+        for k in range(0, len(stamps), BATCH)
+    ]
     return Recording(
-        Path('made'), 's', NMV, tuple(plans), tuple(blocks), samples, (), (), (), (), {}, T0,
-        stamp, 0,
+        Path('made'), 's', NMV, tuple(plans), Held(blocks), Held(pieces), (), (), (), (), {},
+        T0, stamp, 0,
     )
 
 

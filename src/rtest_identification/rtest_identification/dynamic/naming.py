@@ -114,9 +114,10 @@ def name_effects(encoders: Rows, gauges: Rows, offset: TimeOffset) -> Naming:
     offset = _joint_offset(shown, offset)
     shown, notes = _clocks(shown, offset)
     rest = judge_rest(gauge_rows(scene, shown.chosen, gauges.noise))
-    verdict = 'explained' if servo.effects or shown.effects else 'no gap'
+    found = servo.effects or shown.effects
+    verdict = 'explained' if found else 'no gap'
     if rest.probability < REST_ALARM or notes:
-        verdict = 'partly explained' if shown.effects else 'unknown effect'
+        verdict = 'partly explained' if found else 'unknown effect'
     return Naming(verdict, servo, shown, rest, offset, notes)
 
 

@@ -12,12 +12,12 @@ from rtest_estimation import nest as nests
 from rtest_estimation.bagfile import read_bag
 from rtest_estimation.buffers import FeedbackBuffer, GaugeBuffer
 from rtest_estimation.cycle_end import arrivals
-from rtest_estimation.dwell import DwellRules
+from rtest_estimation.dwell import DwellRules, turns
 from rtest_estimation.errors import UserError
 from rtest_estimation.laser.solver import CentreSolver, CentreStatus
 from rtest_estimation.pipeline import Finished
 from rtest_estimation.recording import TYPES, Recording, recording_of
-from rtest_estimation.records import Kind, NestCalibration, NestKind, Status
+from rtest_estimation.records import NestCalibration, NestKind, Status
 from rtest_identification.dynamic.motion import Readings
 from rtest_identification.dynamic.pipeline import DynamicResult, analyse
 from rtest_identification.machine import Machine
@@ -66,15 +66,15 @@ def dynamic_session(
 
     Raises UserError where there is no dynamic cycle, or none with a calibrated nest.
     """
-    cycles = [f.cycle for f in finished if f.cycle.plan.kind is Kind.DYNAMIC]
+    cycles = [f.cycle for f in finished if turns(f.cycle.plan)]
     if not cycles:
         raise UserError('no dynamic cycle in this session; `rtest identify` evaluates static ones')
     nest_of = {f.nest.setup: f.nest for f in finished if f.nest is not None}
     gauges, feedback = GaugeBuffer(), FeedbackBuffer()
-    for block in recording.gauges:
+    for block in recording.gauges.pieces():
         gauges.append(block)
-    for sample in recording.feedback:
-        feedback.append(sample)
+    for piece in recording.feedback.pieces():
+        feedback.extend(piece.axes, piece.stamps, piece.positions)
     start = min(plan.stamp for plan in recording.plans)
     by_setup: dict[str, list[Readings]] = {}
     warnings = list(recording.warnings)

@@ -215,10 +215,10 @@ def _on_lines(
     """Stamps (n,), readings and status (n, lasers), positions (n, 3) on the lines of a scan."""
     plan, end = finished.cycle.plan, finished.cycle.stamp
     gauges, feedback = GaugeBuffer(), FeedbackBuffer()
-    for block in recording.gauges:
+    for block in recording.gauges.pieces():
         gauges.append(block)
-    for sample in recording.feedback:
-        feedback.append(sample)
+    for piece in recording.feedback.pieces():
+        feedback.extend(piece.axes, piece.stamps, piece.positions)
     times, displacement, status = gauges.window(plan.stamp, end)
     stamps, rows = feedback.window(plan, plan.stamp, end)
     if len(stamps) < 2 or not len(times):
