@@ -281,7 +281,8 @@ class _Whitening:
 
     def __init__(self, covariance: np.ndarray, rms: float) -> None:
         readings = float(np.trace(covariance, axis1=1, axis2=2).mean()) / 3.0
-        dwell = max(rms**2 - readings, 0.1 * rms**2)
+        # Of few readings the scatter is singular, and of a single pose there is no residual.
+        dwell = max(rms**2 - readings, 0.1 * rms**2, 1e-9 * readings)
         if rms == 0.0:
             covariance, dwell = np.zeros_like(covariance), 1.0
         total = covariance + dwell * np.eye(3)
