@@ -131,9 +131,12 @@ class Stream(Sequence, Generic[Record]):
         """Messages in the order in which they were recorded."""
         # Counted anew, so that going through them twice counts nothing twice.
         self.left_out, self.damaged = '', 0
+        decoders: dict[Definition, Callable[[list[bytes]], Iterator[Any]]] = {}
         for definition, batch in _batches(self._bag, self._topic):
-            decoder = _decoder(definition, f'{self._bag.path}: topic {self._topic}')
-            for found in decoder(batch):
+            if definition not in decoders:
+                where = f'{self._bag.path}: topic {self._topic}'
+                decoders[definition] = _decoder(definition, where)
+            for found in decoders[definition](batch):
                 if isinstance(found, str):
                     self.left_out = self.left_out or found
                     self.damaged += 1
