@@ -4,7 +4,7 @@
 
 Three gauges at 10 kHz in messages of 100 readings and encoder feedback at 500 Hz are published in
 real time to an estimator and a recorder, each a process of its own as in a session: a nest
-calibration, then one long stop. The age of a sphere centre is the time from the stamp of its
+calibration, then a static cycle. The age of a sphere centre is the time from the stamp of its
 reading to its arrival in a third process; a reading waits up to 10 ms for its message to be full.
 """
 
@@ -34,46 +34,46 @@ from rtest_drivers.domain import free_domain
 from rtest_estimation.nodes import publish
 from rtest_estimation.nodes.qos import LATCHED, LATCHED_100, STREAM
 from rtest_estimation.recording import read_recording
+from rtest_estimation.records import CyclePlan as CyclePlanRecord
+from rtest_estimation.records import Kind
 from rtest_identification.machine import load_machine
-from rtest_identification.plans import nest_calibration
+from rtest_identification.plans import nest_calibration, static
 
 ROOT = Path(__file__).resolve().parents[1]
 MACHINE = ROOT / 'src/rtest_drivers/config/nmv1500dcg.yaml'
 BATCH, PERIOD_NS, FEEDBACK_NS = 100, 100_000, 2_000_000
 TICK_NS = 10_000_000
-MOVE_S, DWELL_S = 0.1, 0.3
+MOVE_S, DWELL_S, REST_S = 0.1, 0.3, 1.0
 NEST = np.array([[0.7, 0.0, 0.714], [-0.35, 0.61, 0.711], [-0.35, -0.61, 0.711]])
 
 
 class Cell(Node):
     """Publishes the readings of a machine that moves through a nest calibration and stops."""
 
-    def __init__(self, plan: object) -> None:
+    def __init__(self) -> None:
         super().__init__('cell')
-        self.plan = plan
-        self.knots = np.arange(2 * len(plan.commands)) // 2 * (MOVE_S + DWELL_S)
-        self.knots[1::2] += DWELL_S
-        self.rows = np.repeat(plan.commands, 2, axis=0)
         self.machine = self.create_publisher(String, 'rtest/machine', LATCHED)
         self.plans = self.create_publisher(CyclePlan, 'rtest/plan', LATCHED_100)
         self.gauges = self.create_publisher(GaugeSamples, 'rtest/gauges', STREAM)
         self.feedback = self.create_publisher(JointState, 'rtest/cnc/feedback', STREAM)
-        self.sequence = 0
+        self.sequence = self.samples = 0
         self.rng = np.random.default_rng(1)
 
-    def positions(self, seconds: np.ndarray) -> np.ndarray:
-        """Axis positions at times after the stamp of the plan."""
-        columns = [np.interp(seconds, self.knots, column) for column in self.rows.T]
-        return np.stack(columns, axis=1)
-
-    def run(self, start: int, seconds: float) -> None:
-        """Publish in real time from `start` [ns] on."""
-        axes = list(self.plan.axes)
+    def run(self, plan: CyclePlanRecord, start: int) -> int:
+        """Publish a cycle in real time from `start` [ns] on; returns when it was over [ns]."""
+        message = publish.cycle_plan(plan)
+        message.header = publish.header(start, 'machine')
+        self.plans.publish(message)
+        knots = np.arange(2 * len(plan.commands)) // 2 * (MOVE_S + plan.dwell)
+        knots[1::2] += plan.dwell
+        rows = np.repeat(plan.commands, 2, axis=0)
+        seconds = knots[-1] + REST_S
+        nest = plan.kind is Kind.NEST_CALIBRATION
         for tick in range(int(seconds * 1e9) // TICK_NS):
             begin = start + tick * TICK_NS
             times = begin + np.arange(BATCH) * PERIOD_NS
-            at = self.positions((times - start) * 1e-9)
-            values = (at[:, :3] - self.plan.commands[0, :3]) @ NEST.T
+            at = _positions((times - start) * 1e-9, knots, rows)
+            values = (at[:, :3] - plan.commands[0, :3]) @ NEST.T * nest
             values += 1e-7 * self.rng.normal(size=values.shape)
             message = GaugeSamples(
                 header=publish.header(begin, 'nest'), sequence=self.sequence,
@@ -84,12 +84,19 @@ class Cell(Node):
             self.sequence += BATCH
             for stamp in range(begin, begin + TICK_NS, FEEDBACK_NS):
                 _sleep_until(stamp)
-                at = self.positions(np.array([(stamp - start) * 1e-9]))[0]
+                at = _positions(np.array([(stamp - start) * 1e-9]), knots, rows)[0]
                 self.feedback.publish(JointState(
-                    header=publish.header(stamp, ''), name=axes, position=at.tolist()
+                    header=publish.header(stamp, ''), name=list(plan.axes), position=at.tolist()
                 ))
+                self.samples += 1
             _sleep_until(begin + TICK_NS)
             self.gauges.publish(data)
+        return begin + TICK_NS
+
+
+def _positions(seconds: np.ndarray, knots: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Axis positions at times after the start of a cycle."""
+    return np.stack([np.interp(seconds, knots, column) for column in rows.T], axis=1)
 
 
 class Listener(Node):
@@ -130,7 +137,8 @@ def _listen(seconds: float) -> None:
     ages = np.array(node.ages)
     print(f'nest calibrations {node.nests}, sphere centres {len(ages)}')
     if len(ages):
-        shown = ', '.join(f'{q:g} %: {np.percentile(ages, q):.1f}' for q in (50, 90, 99, 99.9, 100))
+        shares = (50, 90, 99, 99.9, 100)
+        shown = ', '.join(f'{q:g} %: {np.percentile(ages, q):.1f}' for q in shares)
         print(f'age of the sphere centre [ms]: {shown}')
 
 
@@ -146,8 +154,13 @@ def main() -> None:
     os.environ['ROS_DOMAIN_ID'] = str(free_domain())
     os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
     machine = load_machine(MACHINE)
-    plan = nest_calibration(machine, '1a', np.array([0.0, -0.09, 0.0406]), 1e-3, DWELL_S)
-    seconds = len(plan.commands) * (MOVE_S + DWELL_S) + arguments.seconds
+    sphere = np.array([0.0, -0.09, 0.0406])
+    nest = nest_calibration(machine, '1a', sphere, 1e-3, DWELL_S)
+    levels, stations = np.radians(np.arange(-75, 76, 25)), np.radians(np.arange(12) * 30.0)
+    poses = 2 + len(levels) * len(stations)
+    static_dwell = arguments.seconds / poses - MOVE_S
+    cycle = static(machine, '1a', sphere, levels, stations, static_dwell)
+    seconds = len(nest.commands) * (MOVE_S + DWELL_S) + arguments.seconds + 2 * REST_S
     with tempfile.TemporaryDirectory() as folder:
         commands = [
             ['-m', 'rtest_drivers.nodes.recorder', '--ros-args', '-p', f'out:={folder}', '-p',
@@ -158,19 +171,16 @@ def main() -> None:
         processes = [subprocess.Popen([sys.executable, *command]) for command in commands]
         try:
             rclpy.init()
-            cell = Cell(plan)
+            cell = Cell()
             spinner = SingleThreadedExecutor()
             spinner.add_node(cell)
             threading.Thread(target=spinner.spin, daemon=True).start()
             while min(p.get_subscription_count() for p in (cell.gauges, cell.feedback)) < 2:
                 time.sleep(0.1)
             time.sleep(1.0)
-            start = time.time_ns() + 200_000_000
-            message = publish.cycle_plan(plan)
-            message.header = publish.header(start, 'machine')
             cell.machine.publish(String(data=machine.text))
-            cell.plans.publish(message)
-            cell.run(start, seconds)
+            over = cell.run(nest, time.time_ns() + 200_000_000)
+            cell.run(cycle, over)
             time.sleep(1.0)
             processes[0].send_signal(signal.SIGINT)
             processes[0].wait(30)
@@ -186,7 +196,10 @@ def main() -> None:
         print(f'readings: {cell.sequence} sent, '
               f'{sum(len(block.displacement) for block in recording.gauges)} recorded, '
               f'{recording.lost} lost; feedback: {len(recording.feedback)} of '
-              f'{round(seconds * 1e9) // FEEDBACK_NS} recorded')
+              f'{cell.samples} recorded')
+        if recording.cycles:
+            points = [len(message.points) for message in recording.cycles]
+            print(f'poses measured: {points} of {[len(nest.commands), poses]}')
         print(f'load of the computer: {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores')
 
 
