@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from datetime import datetime, timezone
 from pathlib import Path
 
@@ -15,17 +16,19 @@ from rtest_estimation.yaml_text import load_yaml
 from rtest_identification.offline import estimate_recording
 
 
-def describe(path: str | Path) -> list[str]:
+def describe(path: str | Path, topics: Mapping[str, str] | None = None) -> list[str]:
     """Lines that describe a recording: topics, session, plans, losses, missing poses, warnings.
 
     Works for any bag; one that cannot be identified from is described with the reason.
+
+    topics : role to topic name, as in `rtest_estimation.recording.read_recording`
 
     Raises UserError where there is no recording at `path`.
     """
     bag = read_bag(path, TYPES)
     lines = _file_lines(bag)
     try:
-        recording = recording_of(bag)
+        recording = recording_of(bag, topics)
     except UserError as error:
         warnings: tuple[str, ...] = (*bag.warnings, f'not a complete session: {error}')
     else:
