@@ -39,8 +39,9 @@ def plain(value):
     if isinstance(value, list | tuple):
         return [plain(item) for item in value]
     if dataclasses.is_dataclass(value):
+        names = [one.name for one in dataclasses.fields(value)]
         # Without the constants of the type.
-        names = [one.name for one in dataclasses.fields(value) if not one.name.startswith('__')]
+        names = [name for name in names if not (name.isupper() or name.startswith('__'))]
     else:
         names = getattr(value, '__slots__', [])
     return {name: plain(getattr(value, name)) for name in names} if names else value

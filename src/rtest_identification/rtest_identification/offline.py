@@ -17,10 +17,12 @@ from rtest_estimation.pipeline import EstimationRules, Estimator, Finished
 from rtest_estimation.recording import (
     TYPES,
     Recording,
+    read_recording,
     recorded_machine,
     recording_of,
     temperatures,
 )
+from rtest_estimation.records import CyclePlan, NestCalibration
 from rtest_identification.gap.effects import Effect, library
 from rtest_identification.gap.model_file import Model, load_model
 from rtest_identification.gap.scene import Scene
@@ -37,15 +39,20 @@ def estimate_recording(
     recording: Recording,
     rules: EstimationRules | None = None,
     progress: Callable[[str], None] = lambda line: None,
+    nests: Mapping[str, NestCalibration] | None = None,
 ) -> list[Finished]:
     """Every cycle of a recording, as the estimator node finished them.
 
     Of a cycle that was measured more than once the attempt that counts.
+
+    nests : calibrations by set-up that are used instead of the recording's own
     """
-    estimator = Estimator(rules)
+    estimator = Estimator(rules, nests)
     done: list[Finished] = []
 
     def note(ready: Finished) -> None:
+        if ready.nest is not None and nests:
+            ready = replace(ready, nest=nests.get(ready.nest.setup, ready.nest))
         done.append(ready)
         cycle = ready.cycle
         progress(
@@ -63,6 +70,23 @@ def estimate_recording(
         note(ready)
     kept = {id(cycle) for cycle in counted(one.cycle for one in done)}
     return [one for one in done if id(one.cycle) in kept]
+
+
+def nests_of(path: Path | str, plans: Sequence[CyclePlan]) -> dict[str, NestCalibration]:
+    """Nest calibrations of a recording by set-up.
+
+    plans : of the session that they are for; raises UserError where a set-up of them is missing
+    """
+    finished = estimate_recording(read_recording(path))
+    nests = {one.nest.setup: one.nest for one in finished if one.nest is not None}
+    for plan in plans:
+        if plan.setup not in nests:
+            there = ', '.join(nests) or 'none'
+            raise UserError(
+                f'{path}: no nest calibration of set-up {plan.setup}, there is {there}; give a '
+                'recording that has them all'
+            )
+    return nests
 
 
 def lost_cycles(finished: Iterable[Finished]) -> list[str]:
@@ -101,6 +125,7 @@ def identify_recording(
     model_path: Path | str | None = None,
     tolerances: Tolerances | None = None,
     effects_path: Path | str | None = None,
+    nest_path: Path | str | None = None,
 ) -> Identification:
     """Identify the machine from a recording alone.
 
@@ -112,6 +137,7 @@ def identify_recording(
     model_path : file of a model whose effects are free besides
     tolerances : by which the machine is to be judged afterwards
     effects_path : file of the user's own effects that the model has
+    nest_path : another recording, whose nest calibrations are used
 
     Raises UserError naming file and what is expected.
     """
@@ -129,7 +155,8 @@ def identify_recording(
     if tolerances:
         tolerances.check(machine)
     recording = recording_of(bag, topics)
-    finished = estimate_recording(recording, None, progress)
+    nests = nests_of(nest_path, recording.plans) if nest_path is not None else None
+    finished = estimate_recording(recording, None, progress, nests)
     directions = {f.nest.setup: f.nest.direction for f in finished if f.nest is not None}
     effects = None
     if model:

@@ -41,6 +41,7 @@ from std_srvs.srv import Trigger
 from rtest_drivers.clock import HostClock
 from rtest_drivers.cnc.programs import program_of, start_program
 from rtest_drivers.graph import INCOMPLETE
+from rtest_drivers.provenance import TOPIC, provenance
 from rtest_drivers.schedule import NANOSECONDS, STOPPED_S, Progress, pose_count
 from rtest_estimation.errors import UserError
 from rtest_estimation.missing import grouped
@@ -104,11 +105,12 @@ class SessionNode(Node):
         self.cycle_timeout = self.declare_parameter('cycle_timeout', 0.0).value
         config = self.declare_parameter('config', '').value
         self.config: SessionConfig = load_session(config)
-        self._folder = Path(config).parent
+        self._file, self._folder = Path(config), Path(config).parent
         # As the drivers' stamps, so that a clock that is set does not part plan and readings.
         self._host = HostClock()
 
         self._machine = self.create_publisher(String, 'rtest/machine', LATCHED)
+        self._provenance = self.create_publisher(String, TOPIC, LATCHED)
         self._plans = self.create_publisher(CyclePlanMessage, 'rtest/plan', LATCHED_100)
         self._diagnostics = diagnostics.Diagnostics(self)
         self.create_subscription(Cycle, 'rtest/cycle', self._on_cycle, LATCHED_100)
@@ -151,6 +153,7 @@ class SessionNode(Node):
         """
         self._wait_for_nodes()
         self._machine.publish(String(data=self.config.machine.text))
+        self._provenance.publish(String(data=self._made_by()))
         for name in DRIVERS:
             self._bring_to(name, State.PRIMARY_STATE_INACTIVE)
         self._wait_for_listeners()
@@ -171,6 +174,11 @@ class SessionNode(Node):
         self._status = 'finished'
         self._diagnose()
         return self._problems
+
+    def _made_by(self) -> str:
+        devices = {} if self.simulated else self.config.devices
+        files = {name: device.file for name, device in devices.items()}
+        return provenance(self.session, self._file, files)
 
     def _wait_for_nodes(self) -> None:
         clients = {f'{name}/change_state': client for name, client in self._change.items()}
