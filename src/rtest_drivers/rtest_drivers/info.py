@@ -11,6 +11,7 @@ from rtest_estimation.bagfile import Bag, read_bag
 from rtest_estimation.errors import UserError
 from rtest_estimation.missing import grouped
 from rtest_estimation.pipeline import Finished
+from rtest_estimation.plain_text import printable
 from rtest_estimation.recording import TYPES, Recording, recording_of
 from rtest_estimation.records import CyclePlan
 from rtest_estimation.yaml_text import load_yaml
@@ -100,7 +101,7 @@ def _machine_name(text: str | None) -> str:
     if text is None:
         return 'not recorded'
     try:
-        return str(load_yaml(text, 'machine')['name'])
+        return printable(str(load_yaml(text, 'machine')['name']))
     except (UserError, KeyError, TypeError):
         return 'recorded, without a name'
 

@@ -26,6 +26,7 @@ from mcap.writer import MCAP0_MAGIC
 
 from rtest_estimation.errors import UserError
 from rtest_estimation.message_reader import Definition, full_name
+from rtest_estimation.plain_text import printable
 
 # Name of the metadata records in which a recorder counts what it could not record.
 LOSSES = 'rtest_losses'
@@ -42,7 +43,9 @@ MAX_CHUNK = 256 * 1024 * 1024
 # Measurements are packed to between a half and a twentieth of their size.
 MAX_RATIO = 100
 # What reading a damaged record or chunk ends with (mcap does not wrap the errors underneath).
-_DAMAGE = (McapError, struct.error, ValueError, RuntimeError, zstandard.ZstdError)
+_DAMAGE = (
+    McapError, struct.error, ValueError, OverflowError, RuntimeError, zstandard.ZstdError
+)
 # Losses are listed by topic; more than this is no list of topics.
 _MAX_LOSSES = 1000
 
@@ -186,6 +189,8 @@ class McapScan:
                 self.closed = Footer.read(_stream(content)).summary_start != 0
             elif opcode == Opcode.METADATA:
                 self._note(Metadata.read(_stream(content)))
+        except UserError:
+            raise
         except _DAMAGE as error:
             self._damaged.append(' '.join(str(error).split()) or type(error).__name__)
             return
@@ -276,7 +281,7 @@ class McapScan:
         if channel.id not in self._sources:
             schema = self._schemas.get(channel.schema_id)
             self._sources[channel.id] = Source(
-                _printable(channel.topic), _definition(channel, schema), channel, schema
+                printable(channel.topic), _definition(channel, schema), channel, schema
             )
 
     def _unpack(self, chunk: Chunk) -> bytes:
@@ -306,13 +311,13 @@ class McapScan:
         self.metadata.append(metadata)
         if metadata.name == LOSSES:
             self.losses = {
-                _printable(what): int(count)
+                printable(what): int(count)
                 for what, count in list(metadata.metadata.items())[:_MAX_LOSSES]
                 if count.isascii() and count.isdecimal() and len(count) < 20
             }
         elif metadata.name == MENDED:
             self.warnings += [
-                f'{self.path.name} was mended: {_printable(text)}'
+                f'{self.path.name} was mended: {printable(text)}'
                 for text in list(metadata.metadata.values())[:_MAX_LOSSES]
             ]
 
@@ -373,16 +378,12 @@ def _decompress(chunk: Chunk) -> bytes:
         return zstandard.ZstdDecompressor().decompress(chunk.data, max_output_size=size)
     if chunk.compression == 'lz4':
         return lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=size + 1)
-    raise McapError(f'a chunk packed with {_printable(chunk.compression)!r}')
+    raise McapError(f'a chunk packed with {printable(chunk.compression)!r}')
 
 
 def _definition(channel: Channel, schema: Schema | None) -> Definition:
     if schema is None or channel.message_encoding != 'cdr':
-        return Definition('', _printable(channel.message_encoding), '')
+        return Definition('', printable(channel.message_encoding), '')
     text = schema.data.decode('utf-8', errors='replace')
-    return Definition(full_name(_printable(schema.name)), schema.encoding, text)
+    return Definition(full_name(printable(schema.name)), schema.encoding, text)
 
-
-def _printable(text: str) -> str:
-    """A name of the file without what would command a terminal."""
-    return ''.join(char if char.isprintable() else '?' for char in text)

@@ -41,6 +41,8 @@ NEEDED = {
 }
 # Gaps that a warning lists one by one.
 LISTED_GAPS = 5
+# A session has a few cycles at each of a few sphere positions.
+MAX_PLANS = 10_000
 
 Stamped = TypeVar('Stamped', CyclePlan, Temperature)
 
@@ -292,9 +294,13 @@ def _note_steps(stream: Stream, topic: str, start: int, warnings: list[str]) -> 
 def _plans(arrived: list[CyclePlan], warnings: list[str]) -> tuple[CyclePlan, ...]:
     """Plans by stamp; one that was delivered twice (latched topic) counts once."""
     unique = {(plan.session, plan.cycle, plan.stamp): plan for plan in arrived}
+    if len(unique) > MAX_PLANS:
+        raise UserError(f'{len(unique)} plans in one recording, expected {MAX_PLANS} at most')
     sessions = sorted({plan.session for plan in arrived})
     if len(sessions) > 1:
-        warnings.append(f'plans of several sessions in one recording: {", ".join(sessions)}')
+        listed = ', '.join(sessions[:LISTED_GAPS])
+        more = f' and {len(sessions) - LISTED_GAPS} more' if len(sessions) > LISTED_GAPS else ''
+        warnings.append(f'plans of several sessions in one recording: {listed}{more}')
     return tuple(sorted(unique.values(), key=lambda plan: plan.stamp))
 
 

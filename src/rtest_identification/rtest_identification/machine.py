@@ -10,9 +10,11 @@ from typing import Any
 import numpy as np
 
 from rtest_estimation.errors import UserError
+from rtest_estimation.plain_text import is_name
 from rtest_estimation.yaml_text import load_yaml
 
 BED = 'bed'
+MAX_AXES = 12
 _KEYS = {'name', 'chain', 'axes', 'tool_mm'}
 _AXIS_KEYS = {
     'linear': {'type', 'direction', 'range_mm'},
@@ -109,6 +111,10 @@ def parse_machine(text: str, where: str = 'machine') -> Machine:
     axes_data = data.get('axes')
     if not isinstance(axes_data, dict) or not axes_data:
         raise UserError(f'{where}: axes: expected a mapping of axis letters')
+    if len(axes_data) > MAX_AXES or not all(is_name(str(name)) for name in axes_data):
+        raise UserError(f'{where}: axes: expected {MAX_AXES} at most, and letters for their names')
+    if not is_name(str(data.get('name', ''))):
+        raise UserError(f'{where}: name: expected one that can be printed in a line')
     axes = {str(name): _axis(str(name), spec, where) for name, spec in axes_data.items()}
     chain = data.get('chain')
     if not isinstance(chain, list) or sorted(map(str, chain)) != sorted([*axes, BED]):

@@ -206,7 +206,9 @@ class Driver(Node):
         self._diagnostics.publish(status)
 
     def _parameter(self, name: str, default: Any, description: str) -> None:
-        self.declare_parameter(name, default, ParameterDescriptor(description=description))
+        # Read-only: who can call services of this node cannot name another device.
+        descriptor = ParameterDescriptor(description=description, read_only=True)
+        self.declare_parameter(name, default, descriptor)
 
 
 def run(make_node: Callable[[], Any], args: list[str] | None = None) -> int:

@@ -30,6 +30,7 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from lifecycle_msgs.msg import State, Transition
 from lifecycle_msgs.srv import ChangeState, GetState
+from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.client import Client
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
@@ -99,11 +100,13 @@ class SessionNode(Node):
 
     def __init__(self) -> None:
         super().__init__('session')
-        self.session = self.declare_parameter('session', 'session').value
-        self.simulated = self.declare_parameter('simulated', False).value
-        self.ready_timeout = self.declare_parameter('ready_timeout', 30.0).value
-        self.cycle_timeout = self.declare_parameter('cycle_timeout', 0.0).value
-        config = self.declare_parameter('config', '').value
+        # Read once: who can call services of this node cannot name another file.
+        fixed = ParameterDescriptor(read_only=True)
+        self.session = self.declare_parameter('session', 'session', fixed).value
+        self.simulated = self.declare_parameter('simulated', False, fixed).value
+        self.ready_timeout = self.declare_parameter('ready_timeout', 30.0, fixed).value
+        self.cycle_timeout = self.declare_parameter('cycle_timeout', 0.0, fixed).value
+        config = self.declare_parameter('config', '', fixed).value
         self.config: SessionConfig = load_session(config)
         self._file, self._folder = Path(config), Path(config).parent
         # As the drivers' stamps, so that a clock that is set does not part plan and readings.
