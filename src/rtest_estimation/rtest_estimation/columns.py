@@ -20,7 +20,13 @@ from rtest_estimation.message_reader import (
     field_definitions,
     message_reader,
 )
-from rtest_estimation.messages import MAX_PERIOD_S, MessageError, feedback, gauge_block
+from rtest_estimation.messages import (
+    MAX_PERIOD_S,
+    MAX_POSITION,
+    MessageError,
+    feedback,
+    gauge_block,
+)
 from rtest_estimation.records import Feedback, GaugeBlock
 
 # Messages that are looked at together.
@@ -276,7 +282,10 @@ def _encoders(numbers: dict[str, np.ndarray], first: Any) -> FeedbackColumns | N
         axes = feedback(first).axes
     except MessageError:
         return None
-    return FeedbackColumns(axes, _stamps(numbers), numbers['position'].astype(float, copy=False))
+    positions = numbers['position'].astype(float, copy=False)
+    if (np.abs(positions) > MAX_POSITION).any():
+        return None
+    return FeedbackColumns(axes, _stamps(numbers), positions)
 
 
 def _encoder(message: Any) -> FeedbackColumns:

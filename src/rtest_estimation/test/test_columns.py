@@ -47,6 +47,8 @@ def mixed(tmp_path):
     ]
     for message in encoders:
         bag.add('/rtest/cnc/feedback', message)
+    # Nowhere is a position like this; the one message is left out.
+    bag.add('/rtest/cnc/feedback', joint_state(START + 14 * 10**9, ['Y', 'X'], [1e300, 0.0]))
     return read_recording(bag.close()), sent, encoders
 
 
@@ -61,11 +63,13 @@ def test_they_are_those_that_rosbags_reads(mixed):
         np.testing.assert_array_equal(block.displacement, expected.displacement)
         np.testing.assert_array_equal(block.stamps, expected.stamps)
         assert block.displacement.shape == expected.displacement.shape
+    assert len(recording.feedback) == len(encoders)
     for sample, message in zip(recording.feedback, encoders, strict=True):
         expected = messages.feedback(message)
         assert (sample.stamp, sample.axes) == (expected.stamp, expected.axes)
         np.testing.assert_array_equal(sample.position, expected.position)
-    (left_out,) = (line for line in recording.warnings if 'left out' in line)
+    left_out, other = (line for line in recording.warnings if 'left out' in line)
+    assert '/rtest/cnc/feedback: 1 message left out' in other
     assert '2 messages left out' in left_out and 'expected readings x 7' in left_out
 
 
