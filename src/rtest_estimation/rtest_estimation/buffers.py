@@ -109,8 +109,10 @@ class FeedbackBuffer:
 
 
 class _Readings(NamedTuple):
-    """Readings of equal channels; stamps are in order but where the clock was set."""
+    """Readings of equal channels, in any order; first and last of their stamps [ns]."""
 
+    first: int
+    last: int
     times: np.ndarray
     displacement: np.ndarray
     status: np.ndarray
@@ -128,13 +130,14 @@ class GaugeBuffer:
     @property
     def first(self) -> int:
         """Oldest stamp kept [ns]; 0 when empty."""
-        return int(self.blocks[0].times[0]) if self.blocks else 0
+        return self.blocks[0].first if self.blocks else 0
 
     def append(self, block: GaugeBlock) -> None:
         """Add one message's readings."""
         times = block.stamps
-        self.blocks.append(_Readings(times, block.displacement, block.status))
-        self.last = max(self.last, int(times[-1]))
+        first, last = int(times[0]), int(times[-1])
+        self.blocks.append(_Readings(first, last, times, block.displacement, block.status))
+        self.last = max(self.last, last)
         self._small += 1
         if self._small >= _BLOCKS:
             self.blocks[-self._small :] = _together(self.blocks[-self._small :])
@@ -142,7 +145,7 @@ class GaugeBuffer:
 
     def window(self, start: int, end: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Stamps (n,), displacement and status (n, channels) of the readings in [start, end]."""
-        blocks = [b for b in self.blocks if b.times[0] <= end and b.times[-1] >= start]
+        blocks = [b for b in self.blocks if b.first <= end and b.last >= start]
         if not blocks:
             return np.empty(0, dtype=np.int64), np.empty((0, 0)), np.empty((0, 0), dtype=np.uint8)
         channels = blocks[-1].displacement.shape[1]
@@ -156,8 +159,8 @@ class GaugeBuffer:
     def forget(self, before: int) -> None:
         """Drop what is older than `before` [ns]."""
         small = self.blocks[len(self.blocks) - self._small :]
-        self._small = sum(b.times[-1] >= before for b in small)
-        self.blocks = [b for b in self.blocks if b.times[-1] >= before]
+        self._small = sum(b.last >= before for b in small)
+        self.blocks = [b for b in self.blocks if b.last >= before]
 
 
 def _together(blocks: list[_Readings]) -> list[_Readings]:
@@ -168,4 +171,12 @@ def _together(blocks: list[_Readings]) -> list[_Readings]:
             runs[-1].append(block)
         else:
             runs.append([block])
-    return [_Readings(*map(np.concatenate, zip(*run, strict=True))) for run in runs]
+    return [
+        _Readings(
+            min(b.first for b in run), max(b.last for b in run),
+            np.concatenate([b.times for b in run]),
+            np.concatenate([b.displacement for b in run]),
+            np.concatenate([b.status for b in run]),
+        )
+        for run in runs
+    ]

@@ -20,7 +20,13 @@ from rtest_estimation.message_reader import (
     field_definitions,
     message_reader,
 )
-from rtest_estimation.messages import MAX_PERIOD_S, MessageError, feedback, gauge_block
+from rtest_estimation.messages import (
+    MAX_PERIOD_S,
+    MAX_POSITION,
+    MessageError,
+    feedback,
+    gauge_block,
+)
 from rtest_estimation.records import Feedback, GaugeBlock
 
 # Messages that are looked at together.
@@ -131,9 +137,12 @@ class Stream(Sequence, Generic[Record]):
         """Messages in the order in which they were recorded."""
         # Counted anew, so that going through them twice counts nothing twice.
         self.left_out, self.damaged = '', 0
+        decoders: dict[Definition, Callable[[list[bytes]], Iterator[Any]]] = {}
         for definition, batch in _batches(self._bag, self._topic):
-            decoder = _decoder(definition, f'{self._bag.path}: topic {self._topic}')
-            for found in decoder(batch):
+            if definition not in decoders:
+                where = f'{self._bag.path}: topic {self._topic}'
+                decoders[definition] = _decoder(definition, where)
+            for found in decoders[definition](batch):
                 if isinstance(found, str):
                     self.left_out = self.left_out or found
                     self.damaged += 1
@@ -273,7 +282,10 @@ def _encoders(numbers: dict[str, np.ndarray], first: Any) -> FeedbackColumns | N
         axes = feedback(first).axes
     except MessageError:
         return None
-    return FeedbackColumns(axes, _stamps(numbers), numbers['position'].astype(float, copy=False))
+    positions = numbers['position'].astype(float, copy=False)
+    if (np.abs(positions) > MAX_POSITION).any():
+        return None
+    return FeedbackColumns(axes, _stamps(numbers), positions)
 
 
 def _encoder(message: Any) -> FeedbackColumns:

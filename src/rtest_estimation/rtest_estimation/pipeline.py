@@ -7,7 +7,7 @@ what the node published.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 
@@ -67,13 +67,20 @@ class Finished:
 class Estimator:
     """Collects one session's data in any interleaving and gives finished cycles.
 
+    given : nest calibrations by set-up that are used instead of the session's own
+
     Feed it with `add_plan`, `add_feedback` and `add_gauges`, then ask `finished`; `finish` closes
     what is still open at the end of a session.
     """
 
-    def __init__(self, rules: EstimationRules | None = None) -> None:
+    def __init__(
+        self,
+        rules: EstimationRules | None = None,
+        given: Mapping[str, NestCalibration] | None = None,
+    ) -> None:
         self.rules = rules or EstimationRules()
         self.nests: dict[str, NestCalibration] = {}
+        self._given = given or {}
         self._plans: list[CyclePlan] = []
         self._feedback = FeedbackBuffer()
         self._gauges = GaugeBuffer()
@@ -191,7 +198,7 @@ class Estimator:
         data = (times, displacement, status)
         if plan.kind is Kind.NEST_CALIBRATION:
             return self._calibrate(plan, dwells, missing, data, end)
-        nest = self.nests.get(plan.setup)
+        nest = self._given.get(plan.setup) or self.nests.get(plan.setup)
         if nest is None:
             problem = f'no nest calibration of set-up {plan.setup}'
             everything = tuple(Missing(row, problem) for row in range(len(plan.commands)))

@@ -18,11 +18,12 @@ from rtest_estimation.pipeline import EstimationRules, Estimator, Finished
 from rtest_estimation.recording import (
     TYPES,
     Recording,
+    read_recording,
     recorded_machine,
     recording_of,
     temperatures,
 )
-from rtest_estimation.records import CyclePlan, Kind, NestKind
+from rtest_estimation.records import CyclePlan, Kind, NestCalibration, NestKind
 from rtest_identification.gap.effects import Effect, library
 from rtest_identification.gap.model_file import Model, load_model
 from rtest_identification.gap.scene import Scene
@@ -42,17 +43,21 @@ def estimate_recording(
     recording: Recording,
     rules: EstimationRules | None = None,
     progress: Callable[[str], None] = lambda line: None,
+    nests: Mapping[str, NestCalibration] | None = None,
 ) -> list[Finished]:
     """Every cycle of a recording, as the estimator node finished them.
 
     Of a cycle that was measured more than once the attempt that counts.
 
     rules : those of the node, as far as the recording says, where they are not given
+    nests : calibrations by set-up that are used instead of the recording's own
     """
-    estimator = Estimator(rules or rules_of(recording))
+    estimator = Estimator(rules or rules_of(recording), nests)
     done: list[Finished] = []
 
     def note(ready: Finished) -> None:
+        if ready.nest is not None and nests:
+            ready = replace(ready, nest=nests.get(ready.nest.setup, ready.nest))
         done.append(ready)
         cycle = ready.cycle
         poses = f'{len(cycle.points)} of {len(cycle.plan.commands)} poses'
@@ -97,6 +102,23 @@ def _through_cube(plan: CyclePlan) -> bool:
     return plan.kind is Kind.NEST_CALIBRATION and bool(moved[:, linear].all(axis=1).any())
 
 
+def nests_of(path: Path | str, plans: Sequence[CyclePlan]) -> dict[str, NestCalibration]:
+    """Nest calibrations of a recording by set-up.
+
+    plans : of the session that they are for; raises UserError where a set-up of them is missing
+    """
+    finished = estimate_recording(read_recording(path))
+    nests = {one.nest.setup: one.nest for one in finished if one.nest is not None}
+    for plan in plans:
+        if plan.setup not in nests:
+            there = ', '.join(nests) or 'none'
+            raise UserError(
+                f'{path}: no nest calibration of set-up {plan.setup}, there is {there}; give a '
+                'recording that has them all'
+            )
+    return nests
+
+
 def lost_cycles(finished: Iterable[Finished]) -> list[str]:
     """Why cycles have no point, for example `1a-static 0-85: no gauge readings`."""
     lines = []
@@ -133,6 +155,7 @@ def identify_recording(
     model_path: Path | str | None = None,
     tolerances: Tolerances | None = None,
     effects_path: Path | str | None = None,
+    nest_path: Path | str | None = None,
 ) -> Identification:
     """Identify the machine from a recording alone.
 
@@ -144,6 +167,7 @@ def identify_recording(
     model_path : file of a model whose effects are free besides
     tolerances : by which the machine is to be judged afterwards
     effects_path : file of the user's own effects that the model has
+    nest_path : another recording, whose nest calibrations are used
 
     Raises UserError naming file and what is expected.
     """
@@ -161,7 +185,8 @@ def identify_recording(
     if tolerances:
         tolerances.check(machine)
     recording = recording_of(bag, topics)
-    finished = estimate_recording(recording, None, progress)
+    given = nests_of(nest_path, recording.plans) if nest_path is not None else None
+    finished = estimate_recording(recording, None, progress, given)
     nests = [f.nest for f in finished if f.nest is not None]
     directions = {nest.setup: nest.sensitive for nest in nests}
     effects = None

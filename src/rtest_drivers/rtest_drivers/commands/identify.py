@@ -31,6 +31,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('bags', type=Path, nargs='+', metavar='BAG', help='recorded session')
     parser.add_argument('--machine', type=Path, metavar='FILE',
                         help='machine file to use instead of the recorded one')
+    parser.add_argument('--nest', type=Path, metavar='BAG',
+                        help='another recording, whose nest calibrations are used instead of the '
+                        "recording's own; the nest must not have been taken apart in between")
     parser.add_argument('--tolerance', type=Path, metavar='FILE',
                         help='judge every error by the limits of FILE: pass, fail or undecided '
                         '(ISO 14253-1); for example config/tolerance_example.yaml')
@@ -54,7 +57,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise UserError(f'--monte-carlo {arguments.trials}: expected {MIN_TRIALS} trials or more')
     options = Options(
         arguments.machine, chosen_topics(arguments.topic), arguments.tolerance, arguments.priors,
-        arguments.model, arguments.trials, arguments.effects,
+        arguments.model, arguments.trials, arguments.effects, arguments.nest,
     )
     for bag, out in folders(arguments.bags, arguments.out, OUTPUT):
         identify(bag, out, options)
@@ -92,6 +95,7 @@ class Options:
     """How to identify: other files than the recorded ones, and what to do besides.
 
     trials : of a Monte Carlo propagation; 0 for none
+    nest : recording whose nest calibrations are used
     """
 
     machine: Path | None = None
@@ -101,6 +105,7 @@ class Options:
     model: Path | None = None
     trials: int = 0
     effects: Path | None = None
+    nest: Path | None = None
 
 
 def identify(
@@ -127,7 +132,7 @@ def identify(
     name = recording_name(bag)
     result = identify_recording(
         bag, options.machine, lambda line: quiet or print(f'  {line}', flush=True),
-        options.topics, options.priors, options.model, limits, options.effects,
+        options.topics, options.priors, options.model, limits, options.effects, options.nest,
     )
     for line in _missing(result):
         print(f'  missing: {line}')

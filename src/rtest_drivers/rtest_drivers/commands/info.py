@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from rtest_drivers.topics import add_topic_argument, chosen_topics
 from rtest_estimation.errors import UserError
 
 HELP = 'tell what is in a recording, or mend it'
@@ -18,6 +19,7 @@ HELP = 'tell what is in a recording, or mend it'
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of `rtest info`."""
     parser.add_argument('bag', type=Path, metavar='BAG', help='recorded session')
+    add_topic_argument(parser)
     parser.add_argument('--repair', action='store_true',
                         help='write a mended copy to --out, and say what is missing in it')
     parser.add_argument('--out', type=Path, metavar='FILE',
@@ -33,7 +35,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise UserError('--out: expected together with --repair')
     from rtest_drivers.info import describe
 
-    lines = describe(arguments.bag)
+    lines = describe(arguments.bag, chosen_topics(arguments.topic))
     kinds = [line.split(maxsplit=1)[0] for line in lines]
     print('\n'.join(lines))
     print(

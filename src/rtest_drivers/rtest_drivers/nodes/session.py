@@ -46,6 +46,7 @@ from std_srvs.srv import Trigger
 from rtest_drivers.clock import HostClock
 from rtest_drivers.cnc.programs import program_of, start_program
 from rtest_drivers.graph import INCOMPLETE
+from rtest_drivers.provenance import TOPIC, provenance
 from rtest_drivers.schedule import NANOSECONDS, STOPPED_S, Progress, pose_count, turn
 from rtest_estimation.errors import UserError
 from rtest_estimation.missing import grouped
@@ -110,7 +111,7 @@ class SessionNode(Node):
         self.cycle_timeout = self.declare_parameter('cycle_timeout', 0.0, fixed).value
         config = self.declare_parameter('config', '', fixed).value
         self.config: SessionConfig = load_session(config)
-        self._folder = Path(config).parent
+        self._file, self._folder = Path(config), Path(config).parent
         more = (THERMOMETERS,) if self.config.reads_temperatures(self.simulated) else ()
         self._drivers = (*DRIVERS, *more)
         # Closed in this order: what the earlier one publishes last, the later one still needs.
@@ -120,6 +121,7 @@ class SessionNode(Node):
         self._host = HostClock()
 
         self._machine = self.create_publisher(String, 'rtest/machine', LATCHED)
+        self._provenance = self.create_publisher(String, TOPIC, LATCHED)
         self._plans = self.create_publisher(CyclePlanMessage, 'rtest/plan', LATCHED_100)
         self._diagnostics = diagnostics.Diagnostics(self)
         self.create_subscription(Cycle, 'rtest/cycle', self._on_cycle, LATCHED_100)
@@ -170,6 +172,7 @@ class SessionNode(Node):
             # The drivers are opened next, and need it.
             self._wait_for('/clock of the simulated cell', lambda: self._now() > 0)
         self._machine.publish(String(data=self.config.machine.text))
+        self._provenance.publish(String(data=self._made_by()))
         for name in self._drivers:
             self._bring_to(name, State.PRIMARY_STATE_INACTIVE)
         self._wait_for_listeners()
@@ -197,6 +200,11 @@ class SessionNode(Node):
         start = self._now()
         for number in count():
             yield start + round(number * self.config.every * 1e9)
+
+    def _made_by(self) -> str:
+        devices = {} if self.simulated else self.config.devices
+        files = {name: device.file for name, device in devices.items()}
+        return provenance(self.session, self._file, files)
 
     def _wait_for_nodes(self) -> None:
         clients = {f'{name}/change_state': client for name, client in self._change.items()}
