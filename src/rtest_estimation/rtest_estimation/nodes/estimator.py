@@ -27,6 +27,7 @@ from rtest_estimation.pipeline import EstimationRules, Estimator, Finished
 from rtest_estimation.records import GaugeBlock, NestKind, Status
 from rtest_estimation.records import NestCalibration as NestRecord
 from rtest_estimation.sequence import SequenceCheck
+from rtest_estimation.thinning import Thinning
 
 _KINDS = {'contact': NestKind.CONTACT, 'laser': NestKind.LASER}
 
@@ -39,7 +40,7 @@ class EstimatorNode(Node):
         radius = self.declare_parameter('sphere_radius_mm', 12.7).value
         settle = self.declare_parameter('settle_s', DwellRules().settle).value
         # The stream is for eyes and plots; finished cycles use every reading.
-        self._centre_period = 1e9 / self.declare_parameter('sphere_centre_hz', 100.0).value
+        self._shown = Thinning(1e9 / self.declare_parameter('sphere_centre_hz', 100.0).value)
         kind = self.declare_parameter('nest', 'contact').value
         if kind not in _KINDS:
             raise UserError(f'parameter nest: expected {" or ".join(_KINDS)}, got {kind!r}')
@@ -47,7 +48,6 @@ class EstimatorNode(Node):
             DwellRules(settle=float(settle)), float(radius) * 1e-3, _KINDS[kind]
         )
         self._estimator = Estimator(rules)
-        self._centre_due = 0
         self._solver: CentreSolver | None = None
         self._damaged: list[str] = []
         self._sequence = SequenceCheck()
@@ -95,23 +95,12 @@ class EstimatorNode(Node):
             return
         good = (block.status == Status.VALID).all(axis=1)
         good &= np.isfinite(block.displacement).all(axis=1)
-        rows = self._due(block.stamps, np.flatnonzero(good))
+        rows = self._shown.rows(block.stamps, good)
         centres = self._centres(nest, block.displacement[rows])
         for stamp, centre in zip(block.stamps[rows].tolist(), centres, strict=True):
             if np.isfinite(centre).all():
                 header = publish.header(stamp, 'table')
                 self._centre.publish(PointStamped(header=header, point=publish.point(centre)))
-
-    def _due(self, stamps: np.ndarray, rows: np.ndarray) -> np.ndarray:
-        """Which of these rows of a block are to be seen: of each period the newest."""
-        rows = rows[stamps[rows] >= self._centre_due]
-        if len(rows):
-            # A little less than the period, or a jitter of the stamps would leave every other out.
-            period = int(0.99 * self._centre_period)
-            slot = (stamps[rows] - max(self._centre_due, int(stamps[rows[0]]))) // period
-            rows = rows[np.append(slot[1:] != slot[:-1], True)]
-            self._centre_due = int(stamps[rows[-1]]) + period
-        return rows
 
     def _centres(self, nest: NestRecord, readings: np.ndarray) -> np.ndarray:
         """(n, 3) sphere centres [m]; NaN where a laser nest is not calibrated."""
