@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -24,11 +25,14 @@ from rtest_estimation.nodes import diagnostics, publish
 from rtest_estimation.nodes.qos import LATCHED, LATCHED_100, STREAM
 from rtest_estimation.nodes.run import run
 from rtest_estimation.pipeline import EstimationRules, Estimator, Finished
+from rtest_estimation.records import CyclePlan as PlanRecord
 from rtest_estimation.records import GaugeBlock, NestKind, Status
 from rtest_estimation.records import NestCalibration as NestRecord
 from rtest_estimation.sequence import SequenceCheck
 from rtest_estimation.thinning import Thinning
 
+# A look at the progress is followed by this many times as long without one.
+LOOK_SHARE = 20.0
 _KINDS = {'contact': NestKind.CONTACT, 'laser': NestKind.LASER}
 
 
@@ -54,6 +58,8 @@ class EstimatorNode(Node):
         # Readings that were lost before the current cycle.
         self._lost_before = 0
         self._last: Finished | None = None
+        self._progress: tuple[PlanRecord, int] | None = None
+        self._look_at = 0.0
 
         self._nest = self.create_publisher(NestCalibration, 'rtest/nest', LATCHED)
         self._centre = self.create_publisher(PointStamped, 'rtest/sphere_centre', STREAM)
@@ -142,7 +148,7 @@ class EstimatorNode(Node):
         return response
 
     def _report(self) -> None:
-        progress = self._estimator.progress()
+        progress = self._look_at_progress()
         values = {
             'discarded_feedback': self._estimator.discarded,
             'damaged': len(self._damaged),
@@ -165,6 +171,18 @@ class EstimatorNode(Node):
         if self._damaged:
             level, line = diagnostics.WARN, f'damaged message: {self._damaged[-1]}'
         self._diagnostics.publish(diagnostics.status('estimator: cycle', level, line, values))
+
+    def _look_at_progress(self) -> tuple[PlanRecord, int] | None:
+        """Poses reached so far; after a look that took long not so soon again.
+
+        Readings must not wait for it, on a busy computer and in a cycle of a thousand poses.
+        """
+        plan = self._estimator.current
+        begun = time.monotonic()
+        if begun >= self._look_at or self._progress is None or self._progress[0] is not plan:
+            self._progress = self._estimator.progress()
+            self._look_at = begun + LOOK_SHARE * (time.monotonic() - begun)
+        return self._progress
 
     def close(self) -> None:
         """Publish what is still open when the process is told to stop."""
