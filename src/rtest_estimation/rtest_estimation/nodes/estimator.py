@@ -32,7 +32,7 @@ from rtest_estimation.sequence import SequenceCheck
 from rtest_estimation.thinning import Thinning
 
 # A look at the progress is followed by this many times as long without one.
-LOOK_SHARE = 20.0
+LOOK_SHARE = 4.0
 _KINDS = {'contact': NestKind.CONTACT, 'laser': NestKind.LASER}
 
 
