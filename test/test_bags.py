@@ -11,10 +11,14 @@ from rosbags.highlevel import AnyReader
 from rtest_drivers.info import describe
 from rtest_drivers.sim.check import check
 from rtest_drivers.sim.truth import load_truth
+from rtest_estimation import messages
+from rtest_estimation.laser import CentreStatus
+from rtest_estimation.laser.correction import THESIS
 from rtest_estimation.recording import read_recording
 from rtest_identification.dynamic.offline import dynamic_recording
 from rtest_identification.gap.offline import gap_recording
-from rtest_identification.offline import identify_recording
+from rtest_identification.laser.recorded import laser_recording
+from rtest_identification.offline import estimate_recording, identify_recording
 from rtest_identification.output import as_dict, write
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -61,6 +65,52 @@ def test_the_model_gap_of_the_node_is_that_of_the_command():
     assert (published.noise, published.before, published.after) == (
         gap.noise, gap.before, gap.after
     )
+
+
+def test_a_laser_nest_estimated_anew_gives_what_the_node_published():
+    recording = read_recording(BAGS / 'laser')
+    finished = {f.cycle.plan.cycle: f for f in estimate_recording(recording)}
+    for nest in map(messages.nest_calibration, recording.nests):
+        again = finished[nest.calibration.rpartition('/')[2]].nest
+        np.testing.assert_array_equal(nest.spot, again.spot)
+        np.testing.assert_array_equal(nest.correction_nodes, again.correction_nodes)
+        np.testing.assert_array_equal(nest.correction_values, again.correction_values)
+        assert (nest.kind, nest.sphere_radius) == (again.kind, 25e-3)
+    for cycle in map(messages.cycle, recording.cycles):
+        again = finished[cycle.plan.cycle].cycle
+        assert len(cycle.points) == len(again.points)
+        for one, other in zip(cycle.points, again.points, strict=True):
+            np.testing.assert_array_equal(one.displacement, other.displacement)
+            np.testing.assert_array_equal(one.covariance, other.covariance)
+    assert len(finished['low-verification'].cycle.points) == 1185
+
+
+def test_the_laser_nest_is_worth_what_the_thesis_says_of_its_own():
+    result = laser_recording(BAGS / 'laser')
+    low, high = result.checks
+    assert high.verification is None
+    assert low.verification.count(CentreStatus.VALID) == 1185
+    # Table 5-5: 6.5 +- 3.8 um without, 1.4 +- 0.7 um with the thesis's correction.
+    assert low.verification.raw.mean == pytest.approx(6.5e-6, abs=0.5e-6)
+    (thesis,) = [one.verified for one in low.kernels if one.kernel == THESIS]
+    assert thesis.mean == pytest.approx(1.4e-6, abs=0.2e-6)
+    assert low.verification.corrected.mean < 0.9 * thesis.mean
+    # Table 5-2: noise level 1 um; the areas of a sphere of twice the radius.
+    assert [scan.laser for scan in result.scans] == [1, 2, 3]
+    for scan in result.scans:
+        assert scan.profile.noise == pytest.approx(1e-6, rel=0.15)
+        assert scan.profile.bounded and 0.95e-3 < scan.profile.measurable < 1.25e-3
+
+
+def test_the_truth_comes_back_through_lasers(tmp_path):
+    result = identify_recording(BAGS / 'laser')
+    # 6 degrees of freedom of visits to one place would say 0.2 um and find a misfit.
+    assert 0.4e-6 < result.noise < 0.9e-6
+    assert not [text for text in result.warnings if 'lacks an effect' in text]
+    path = tmp_path / 'identification.json'
+    path.write_text(json.dumps(as_dict(result)))
+    comparison = check(BAGS / 'laser-cell.yaml', path)
+    assert all(row.ok for row in comparison.constants), comparison.table()
 
 
 def test_the_truth_of_the_simulated_cell_comes_back(tmp_path):

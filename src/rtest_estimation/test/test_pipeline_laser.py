@@ -1,6 +1,7 @@
 """A laser nest through the estimator, with readings by bisection, which share no code with it."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -140,3 +141,29 @@ def test_the_mean_readings_of_every_pose_are_kept():
     mean = dict((dwell.index, mean) for dwell, mean in static.means)[2].mean
     expected = bisect(spots(3), directions(3), OFFSETS[2:3])[0] + 1e-4 * np.arange(1, 4)
     np.testing.assert_allclose(mean, expected, atol=2e-7)
+
+
+def test_a_scan_ends_where_it_comes_to_rest_and_not_in_passing():
+    """A dynamic cycle that goes through its last pose without a stop before it stands there."""
+    ends = 1e-3 * np.array([[0, 0, 0], [1, 0, 0], [-1, 0, 0], [1, 1, 0], [0, 0, 0]])
+    scan = replace(plan(T0, '1a-scan-1', Kind.DYNAMIC, ends), dwell=0.0, feed=2e-3)
+    positions = [SPHERE] * HZ
+    for before, after in pairwise(ends):
+        steps = int(np.linalg.norm(after - before) / scan.feed * HZ)
+        share = np.arange(1, steps + 1)[:, None] / steps
+        positions += [*(SPHERE + before + share * (after - before))]
+    arrival = T0 + (len(positions) - 1) * 10_000_000
+    positions += [SPHERE] * (2 * HZ)
+    estimator, done = Estimator(RULES), []
+    estimator.add_plan(scan)
+    for k, position in enumerate(positions):
+        stamp = T0 + k * 10_000_000
+        estimator.add_feedback(Feedback(stamp, AXES, np.r_[position, 0.0, 0.0]))
+        estimator.add_gauges(
+            GaugeBlock(stamp, k, 0.0, np.zeros((1, 3)), np.zeros((1, 3), np.uint8))
+        )
+        while (ready := estimator.finished()) is not None:
+            done.append((ready.cycle.stamp, stamp))
+    ((end, told),) = done
+    assert end == pytest.approx(arrival + 500_000_000, abs=100_000_000)
+    assert told - end < 100_000_000

@@ -52,7 +52,7 @@ from rtest_estimation.errors import UserError
 from rtest_estimation.missing import grouped
 from rtest_estimation.nodes import diagnostics, publish
 from rtest_estimation.nodes.qos import LATCHED, LATCHED_100
-from rtest_estimation.records import CyclePlan, Kind, Missing
+from rtest_estimation.records import CyclePlan, Kind, Missing, NestKind
 from rtest_identification.session_file import (
     BY_HAND,
     UNATTENDED,
@@ -461,6 +461,8 @@ class SessionNode(Node):
             self.wait(lambda: cycle.calibration in self._nests, 1.0 if cycle.calibration else 0.0)
             nest = self._nests.get(cycle.calibration)
             text += f', residual {nest.residual * 1e6:.2f} µm' if nest else ', no calibration'
+            if nest and nest.kind == NestKind.LASER:
+                text += ' before the correction'
         return text
 
     def _judge(self, started: dict[str, list[tuple[str, int]]]) -> None:

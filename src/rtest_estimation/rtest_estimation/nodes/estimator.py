@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import time
 from collections import Counter
 from collections.abc import Callable
 from typing import Any
@@ -25,10 +26,14 @@ from rtest_estimation.nodes import diagnostics, publish
 from rtest_estimation.nodes.qos import LATCHED, LATCHED_100, STREAM
 from rtest_estimation.nodes.run import run, when_time_goes_back
 from rtest_estimation.pipeline import EstimationRules, Estimator, Finished
+from rtest_estimation.records import CyclePlan as PlanRecord
 from rtest_estimation.records import GaugeBlock, NestKind, Status
 from rtest_estimation.records import NestCalibration as NestRecord
 from rtest_estimation.sequence import SequenceCheck
+from rtest_estimation.thinning import Thinning
 
+# A look at the progress is followed by this many times as long without one.
+LOOK_SHARE = 4.0
 _KINDS = {'contact': NestKind.CONTACT, 'laser': NestKind.LASER}
 
 
@@ -47,7 +52,6 @@ class EstimatorNode(Node):
         self._rules = EstimationRules(
             DwellRules(settle=float(settle)), float(radius) * 1e-3, _KINDS[kind]
         )
-        self._last: Finished | None = None
         self._begin()
         self._back = when_time_goes_back(self, self._begin)
 
@@ -65,8 +69,11 @@ class EstimatorNode(Node):
 
     def _begin(self) -> None:
         self._estimator = Estimator(self._rules)
+        self._last: Finished | None = None
+        self._progress: tuple[PlanRecord, int] | None = None
+        self._look_at = 0.0
         self._received: Counter[str] = Counter()
-        self._centre_due = 0
+        self._shown = Thinning(self._centre_period)
         self._solver: CentreSolver | None = None
         self._damaged: list[str] = []
         self._sequence = SequenceCheck()
@@ -105,23 +112,12 @@ class EstimatorNode(Node):
             return
         good = (block.status == Status.VALID).all(axis=1)
         good &= np.isfinite(block.displacement).all(axis=1)
-        rows = self._due(block.stamps, np.flatnonzero(good))
+        rows = self._shown.rows(block.stamps, good)
         centres = self._centres(nest, block.displacement[rows])
         for stamp, centre in zip(block.stamps[rows].tolist(), centres, strict=True):
             if np.isfinite(centre).all():
                 header = publish.header(stamp, 'table')
                 self._centre.publish(PointStamped(header=header, point=publish.point(centre)))
-
-    def _due(self, stamps: np.ndarray, rows: np.ndarray) -> np.ndarray:
-        """Which of these rows of a block are to be seen: of each period the newest."""
-        rows = rows[stamps[rows] >= self._centre_due]
-        if len(rows):
-            # A little less than the period, or a jitter of the stamps would leave every other out.
-            period = int(0.99 * self._centre_period)
-            slot = (stamps[rows] - max(self._centre_due, int(stamps[rows[0]]))) // period
-            rows = rows[np.append(slot[1:] != slot[:-1], True)]
-            self._centre_due = int(stamps[rows[-1]]) + period
-        return rows
 
     def _centres(self, nest: NestRecord, readings: np.ndarray) -> np.ndarray:
         """(n, 3) sphere centres [m]; NaN where a laser nest is not calibrated."""
@@ -169,7 +165,7 @@ class EstimatorNode(Node):
         return response
 
     def _report(self) -> None:
-        progress = self._estimator.progress()
+        progress = self._look_at_progress()
         values = {
             'discarded_feedback': self._estimator.discarded,
             'damaged': len(self._damaged),
@@ -192,6 +188,18 @@ class EstimatorNode(Node):
         if self._damaged:
             level, line = diagnostics.WARN, f'damaged message: {self._damaged[-1]}'
         self._diagnostics.publish(diagnostics.status('estimator: cycle', level, line, values))
+
+    def _look_at_progress(self) -> tuple[PlanRecord, int] | None:
+        """Poses reached so far; after a look that took long not so soon again.
+
+        Readings must not wait for it, on a busy computer and in a cycle of a thousand poses.
+        """
+        plan = self._estimator.current
+        begun = time.monotonic()
+        if begun >= self._look_at or self._progress is None or self._progress[0] is not plan:
+            self._progress = self._estimator.progress()
+            self._look_at = begun + LOOK_SHARE * (time.monotonic() - begun)
+        return self._progress
 
     def close(self) -> None:
         """Publish what is still open when the process is told to stop."""

@@ -136,7 +136,7 @@ def _told(check: NestCheck) -> list[str]:
         f'{nest.setup}: {len(nest.spot)} lasers, {len(nest.correction_nodes)} positions; Eq. 5-4 '
         f'alone leaves {nest.residual * _UM:.2f} µm rms there'
     ]
-    head = f'    {"error [µm]":36} {"left-out node":>13}'
+    head = f'    {"error [µm]":42} {"left-out node":>13}'
     if verification is None:
         return [*told, head, *(_row(one, check) for one in _best_of_each(check))]
     outside = len(check.positions) - verification.count(CentreStatus.VALID)
@@ -148,14 +148,14 @@ def _told(check: NestCheck) -> list[str]:
     for name, found in (
         ('contact algorithm (Eq. 2-6)', check.contact), ('not corrected', verification.raw)
     ):
-        told.append(f'    {name:36} {"":13}{_numbers(found)}')
+        told.append(f'    {name:42} {"":13}{_numbers(found)}')
     return told + [_row(one, check) for one in _best_of_each(check)]
 
 
 def _row(one: KernelCheck, check: NestCheck) -> str:
     left = f'{one.left_out * _UM:13.2f}' if one.left_out is not None else f'{"":13}'
     mark = '*' if one.kernel == check.chosen else ' '
-    return f'  {mark} {kernel_name(one.kernel):36} {left}{_numbers(one.verified)}'.rstrip()
+    return f'  {mark} {kernel_name(one.kernel):42} {left}{_numbers(one.verified)}'.rstrip()
 
 
 def _best_of_each(check: NestCheck) -> list[KernelCheck]:

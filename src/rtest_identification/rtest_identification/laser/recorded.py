@@ -108,6 +108,15 @@ def laser_recording(
         raise UserError(
             f'{path}: the nest is of contact gauges; if it is of lasers, give --sphere-radius-mm'
         )
+    return evaluate(recording, rules, progress)
+
+
+def evaluate(
+    recording: Recording,
+    rules: EstimationRules,
+    progress: Callable[[str], None] = lambda line: None,
+) -> LaserResult:
+    """As `laser_recording`, of a recording that was read."""
     finished = estimate_recording(recording, rules, progress)
     checks = tuple(_check(one, finished) for one in finished if one.nest is not None)
     warnings = [*recording.warnings]
@@ -124,7 +133,7 @@ def laser_recording(
                 warnings.append(f'{one.cycle.plan.cycle}: {error}')
     if not checks and not scans:
         why = '; '.join(warnings) or 'it has no nest calibration and no scan'
-        raise UserError(f'{path}: nothing of a laser nest could be evaluated: {why}')
+        raise UserError(f'{recording.path}: nothing of a laser nest could be evaluated: {why}')
     return LaserResult(
         recording.session, rules.sphere_radius, checks, tuple(scans), tuple(warnings)
     )
