@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import shutil
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -101,6 +102,16 @@ def test_metadata_is_what_rosbag2_needs():
     assert not topics
 
 
+@cache
+def short_identified():
+    return identify_recording(SHORT)
+
+
+@cache
+def short_gap():
+    return gap_recording(SHORT).result
+
+
 def same(one, other):
     np.testing.assert_array_equal(one.location.value, other.location.value)
     np.testing.assert_array_equal(one.location.covariance, other.location.covariance)
@@ -109,8 +120,8 @@ def same(one, other):
 
 def test_a_bare_file_is_enough(tmp_path, capsys):
     bare = Path(shutil.copy(FILE, tmp_path / 'alone.mcap'))
-    same(identify_recording(bare), identify_recording(SHORT))
-    gap, whole = gap_recording(bare).result, gap_recording(SHORT).result
+    same(identify_recording(bare), short_identified())
+    gap, whole = gap_recording(bare).result, short_gap()
     assert (gap.verdict, gap.gap) == (whole.verdict, whole.gap)
     assert [m for b in Playlist(bare).batches() for m in b] == [
         m for b in Playlist(SHORT).batches() for m in b
@@ -153,13 +164,13 @@ def foreign(folder, plugin):
 def test_a_foreign_recording_with_other_names_gives_the_same(tmp_path, plugin, capsys):
     bag = foreign(tmp_path / 'foreign', plugin)
     option = ['--topic', 'feedback=/axes']
-    same(identify_recording(bag, topics={'feedback': '/axes'}), identify_recording(SHORT))
+    same(identify_recording(bag, topics={'feedback': '/axes'}), short_identified())
     assert main(['info', str(bag), *option]) == 0
     assert 'missing   0 of' in capsys.readouterr().out
     assert main(['identify', str(bag), '--out', str(tmp_path / 'out')]) == 2
     assert 'choose with --topic feedback=NAME' in capsys.readouterr().err
     gap = gap_recording(bag, topics={'feedback': '/axes'}).result
-    assert gap.gap == gap_recording(SHORT).result.gap
+    assert gap.gap == short_gap().gap
     messages = [m for b in Playlist(bag, {'feedback': '/axes'}).batches() for m in b]
     assert {(SOURCES[m.topic], m.time, m.data) for b in Playlist(SHORT).batches() for m in b} == {
         (m.topic, m.time, m.data) for m in messages
