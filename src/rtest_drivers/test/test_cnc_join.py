@@ -79,6 +79,25 @@ def test_recent_forgets(monkeypatch: pytest.MonkeyPatch) -> None:
     assert recent.largest == 0
 
 
+@pytest.mark.parametrize(
+    ('step', 'way'), [(10.0, 'forward by 10.'), (0.25, 'forward by 0.2'), (-0.15, 'back by 0.1'),
+                      (-10.0, 'back by 10.'), (0.03, ''), (-0.03, '')],
+)
+def test_a_clock_that_is_set_is_told_and_followed(step: float, way: str) -> None:
+    """Messages every 50 ms with up to 40 ms under way."""
+    rng, clock = np.random.default_rng(3), DeviceClock()
+    said, late = '', 0
+    for number in range(200):
+        host = 10**12 + number * 50 * MS
+        ahead = round(step * 1e9) if number >= 100 else 0
+        (stamp,) = clock.to_host([host + ahead], host + round(rng.uniform(0, 40)) * MS)
+        late = stamp - host
+        assert number >= 100 or clock.problem() == ''
+        said = said or clock.problem()
+    assert way in said and bool(said) == bool(way)
+    assert abs(late) < 40 * MS
+
+
 def test_axes_keep_their_value_and_close_samples_are_one_feedback() -> None:
     joiner = Joiner(AXES, 5 * MS)
     assert joiner.add([Sample(10 * MS, 'X', 1.0)]) == []
