@@ -8,6 +8,7 @@ from typing import Any
 import yaml
 
 from rtest_drivers.cnc.axes import LENGTHS, UNITS, AxisSource
+from rtest_drivers.gauges.config import _Loader
 from rtest_estimation.dwell import ROTARY_LETTERS
 from rtest_estimation.errors import UserError
 from rtest_identification.session_reader import Reader
@@ -59,6 +60,7 @@ class DeviceReader(Reader):
             raise UserError(f'{where}: expected a mapping of {key}, unit and sign')
         axis = DeviceReader(where, spec)
         axis.only({key, 'unit', 'sign'})
+        axis.required(key)
         source: str | int = axis.integer(key, -1, (0, 99)) if kind is int else axis.text(key)
         unit = axis.text('unit')
         if unit not in UNITS:
@@ -67,9 +69,9 @@ class DeviceReader(Reader):
             turns = 'rotary' if name in ROTARY_LETTERS else 'linear'
             raise UserError(f'{where}: unit: {unit} is no unit of the {turns} axis {name}')
         sign = spec.get('sign', 1)
-        if sign not in (1, -1) or isinstance(sign, bool):
+        if type(sign) is not int or sign not in (1, -1):
             raise UserError(f'{where}: sign: expected 1 or -1, got {sign!r}')
-        return AxisSource(name, source, unit, int(sign))
+        return AxisSource(name, source, unit, sign)
 
 
 def load(path: str, known: set[str]) -> DeviceReader:
@@ -78,7 +80,7 @@ def load(path: str, known: set[str]) -> DeviceReader:
     Raises UserError naming file, key and what is expected.
     """
     try:
-        data = yaml.safe_load(Path(path).read_text(encoding='utf-8'))
+        data = yaml.load(Path(path).read_text(encoding='utf-8'), _Loader)
     except (OSError, UnicodeDecodeError) as error:
         raise UserError(f'{path}: cannot read the device file: {error}') from None
     except yaml.YAMLError as error:

@@ -7,8 +7,8 @@ import math
 import socket
 import time
 from typing import Any
-from urllib.parse import urlsplit
 
+from rtest_drivers.addresses import split_url
 from rtest_drivers.cnc.mtconnect_xml import LARGEST, DocumentError
 from rtest_estimation.errors import UserError
 
@@ -43,16 +43,11 @@ class Agent:
     def __init__(self, url: str) -> None:
         """Raises UserError where `url` is not one of an agent."""
         self.url = url
-        parts = urlsplit(url)
-        try:
-            good = parts.scheme == 'http' and parts.hostname and not parts.query
-            port = parts.port or 80
-        except ValueError:
-            good = False
-        if not good:
+        parts = split_url(url)
+        if parts is None or parts.scheme != 'http' or parts.query:
             raise UserError(f'url: expected http://HOST:PORT of an MTConnect agent, got {url!r}')
         self._base = parts.path.rstrip('/')
-        self._connection = _Connection(parts.hostname, port, timeout=_REPLY_S)
+        self._connection = _Connection(parts.hostname, parts.port or 80, timeout=_REPLY_S)
 
     def get(self, path: str, limit: float = _REPLY_S) -> bytes:
         """The document at `path`, also one that says an error, whole within `limit` [s].

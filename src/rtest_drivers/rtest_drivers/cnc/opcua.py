@@ -31,6 +31,7 @@ from dataclasses import dataclass
 from datetime import datetime, timedelta, timezone
 from typing import Any
 
+from rtest_drivers.addresses import split_url
 from rtest_drivers.clock import HostClock
 from rtest_drivers.cnc.axes import AxisSource
 from rtest_drivers.cnc.clock import DeviceClock, Recent
@@ -41,6 +42,11 @@ from rtest_estimation.errors import UserError
 from rtest_estimation.records import Feedback
 
 STAMPS = ('source', 'arrival')
+# Of security: OPC 10000-7, as asyncua knows them.
+POLICIES = (
+    'Basic256Sha256', 'Aes128Sha256RsaOaep', 'Aes256Sha256RsaPss', 'Basic256', 'Basic128Rsa15',
+)
+MODES = ('Sign', 'SignAndEncrypt')
 _KEYS = {
     'url', 'user', 'password', 'security', 'period_ms', 'stamp', 'skew_ms', 'axes', 'estop',
 }
@@ -79,9 +85,21 @@ def load_opcua(path: str) -> OpcUaFile:
                 f'{section.where}: value: expected true, false, a number or a text, got {estop!r}'
             )
         nodes[_ESTOP] = DeviceReader(section.where, section.data).text('node')
+    url, security = reader.text('url'), reader.text('security', '')
+    parts = split_url(url)
+    if parts is None or parts.scheme != 'opc.tcp' or parts.port is None:
+        raise UserError(f'{path}: url: expected opc.tcp://HOST:PORT, got {url!r}')
+    words = security.split(',')
+    if security and (
+        len(words) < 4 or words[0] not in POLICIES or words[1] not in MODES or not all(words)
+    ):
+        raise UserError(
+            f'{path}: security: expected POLICY,MODE,CERTIFICATE,KEY with a policy of '
+            f'{list(POLICIES)} and a mode of {list(MODES)}, got {security!r}'
+        )
     link = LinkSettings(
-        reader.text('url'), reader.text('user', ''), reader.text('password', ''),
-        reader.text('security', ''), nodes, reader.number('period_ms', 20.0, (1.0, 1000.0)) * 1e-3,
+        url, reader.text('user', ''), reader.text('password', ''),
+        security, nodes, reader.number('period_ms', 20.0, (1.0, 1000.0)) * 1e-3,
     )
     return OpcUaFile(
         link, axes, reader.choice('stamp', STAMPS) == 'source',

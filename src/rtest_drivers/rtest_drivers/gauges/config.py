@@ -24,6 +24,7 @@ from typing import Any
 
 import yaml
 
+from rtest_drivers.addresses import split_url
 from rtest_drivers.gauges import heidenhain, keyence, line_protocol, mitutoyo
 from rtest_drivers.gauges.frames import UNITS, Line, Protocol
 from rtest_estimation.errors import UserError
@@ -120,8 +121,11 @@ def _controller(where: str, entry: Any) -> ControllerConfig:
     make, options = PROTOCOLS[name]
     reader.only(_KEYS | options)
     port = reader.required('port')
-    if not isinstance(port, str) or not port:
-        raise UserError(f'{where}: port: expected a device or URL, got {port!r}')
+    if not isinstance(port, str) or not _port_is_good(port):
+        raise UserError(
+            f'{where}: port: expected a device, socket://HOST:PORT or rfc2217://HOST:PORT, '
+            f'got {port!r}'
+        )
     channels = _whole_numbers(reader, 'channels')
     unit = _choice(reader, 'unit', UNITS)
     protocol = make(len(channels), unit, reader)
@@ -137,6 +141,14 @@ def _controller(where: str, entry: Any) -> ControllerConfig:
         reader.number('rate_hz', protocol.rate, _RATE_HZ),
         reader.number('timeout_s', 0.25, _TIMEOUT_S),
     )
+
+
+def _port_is_good(port: str) -> bool:
+    """A path, or one of the two kinds of URL that are a line; pyserial knows others."""
+    if '://' not in port:
+        return bool(port) and port.isprintable()
+    parts = split_url(port)
+    return parts is not None and parts.scheme in ('socket', 'rfc2217') and parts.port is not None
 
 
 def _check(path: str, controllers: tuple[ControllerConfig, ...]) -> None:
