@@ -26,9 +26,9 @@ except ImportError:  # Before Python 3.11.
 
 OPTIONS = {'query', 'terminator', 'pattern', 'no_signal', 'over_range'}
 _LONGEST = 80
-# Ways in which a pattern can be laid over a line: what a line that does not match may cost. Trying
-# a million takes about 0.1 s.
-_MOST_WAYS = 1e6
+# Ways in which a pattern can be laid over a line; one that does not match may take all of them. As
+# many as those of four times `.*` cost half a second at worst.
+_MOST_WAYS = (_LONGEST + 1) ** 4
 _REPEATS = ('MAX_REPEAT', 'MIN_REPEAT', 'POSSESSIVE_REPEAT')
 _NUMBER = re.compile(rb'[+-]?\d{1,12}(\.\d{1,12})?')
 
@@ -43,7 +43,7 @@ def line(outputs: int, unit: str, options: Reader) -> Protocol:
         if _ways(parser.parse(text['pattern'])) > math.log(_MOST_WAYS):
             raise UserError(
                 f'{where}: pattern: matching it could take too long; write how often a thing '
-                'comes, such as {1,6}, instead of more than three * and +, and repeat no group'
+                'comes, such as {1,6}, instead of more than four * and +, and repeat no group'
             )
         pattern = re.compile(text['pattern'].encode())
     except (re.error, OverflowError) as error:
