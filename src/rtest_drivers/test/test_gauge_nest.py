@@ -511,3 +511,10 @@ def test_check_of_a_nest(cell) -> None:
     assert math.isnan(dead.rate)
     assert dead.channels[0].status is None
 
+
+def test_simulated_displays_without_a_reading_answer_all_the_same() -> None:
+    for value in (math.nan, math.inf, -math.inf):
+        display, gauge = Nd287(lambda value=value: [value]), Digimatic(lambda value=value: [value])
+        assert display.answer(b'\x1bA0200') == b'\x15'
+        assert b'?' in display.answer(b'\x02')
+        assert gauge.answer(b'1') == gauge.error(b'1')

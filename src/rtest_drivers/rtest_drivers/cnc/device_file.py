@@ -57,6 +57,7 @@ class DeviceReader(Reader):
             raise UserError(f'{where}: expected a mapping of {key}, unit and sign')
         axis = DeviceReader(where, spec)
         axis.only({key, 'unit', 'sign'})
+        axis.required(key)
         source: str | int = axis.integer(key, -1, (0, 99)) if kind is int else axis.text(key)
         unit = axis.text('unit')
         if unit not in UNITS:
@@ -65,9 +66,9 @@ class DeviceReader(Reader):
             turns = 'rotary' if name in ROTARY_LETTERS else 'linear'
             raise UserError(f'{where}: unit: {unit} is no unit of the {turns} axis {name}')
         sign = spec.get('sign', 1)
-        if sign not in (1, -1) or isinstance(sign, bool):
+        if type(sign) is not int or sign not in (1, -1):
             raise UserError(f'{where}: sign: expected 1 or -1, got {sign!r}')
-        return AxisSource(name, source, unit, int(sign))
+        return AxisSource(name, source, unit, sign)
 
 
 def load(path: str, known: set[str]) -> DeviceReader:

@@ -23,6 +23,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from rtest_drivers.addresses import split_url
 from rtest_drivers.gauges import heidenhain, keyence, line_protocol, mitutoyo
 from rtest_drivers.gauges.frames import UNITS, Line, Protocol
 from rtest_estimation.errors import UserError
@@ -124,8 +125,11 @@ def controller_entries(path: Path | str) -> list[Reader]:
 def port_of(reader: Reader) -> str:
     """The key `port`."""
     port = reader.required('port')
-    if not isinstance(port, str) or not port:
-        raise UserError(f'{reader.where}: port: expected a device or URL, got {port!r}')
+    if not isinstance(port, str) or not _port_is_good(port):
+        raise UserError(
+            f'{reader.where}: port: expected a device, socket://HOST:PORT or rfc2217://HOST:PORT, '
+            f'got {port!r}'
+        )
     return port
 
 
@@ -157,6 +161,14 @@ def _controller(reader: Reader) -> ControllerConfig:
         reader.number('rate_hz', protocol.rate, _RATE_HZ),
         reader.number('timeout_s', 0.25, _TIMEOUT_S),
     )
+
+
+def _port_is_good(port: str) -> bool:
+    """A path, or one of the two kinds of URL that are a line; pyserial knows others."""
+    if '://' not in port:
+        return bool(port) and port.isprintable()
+    parts = split_url(port)
+    return parts is not None and parts.scheme in ('socket', 'rfc2217') and parts.port is not None
 
 
 def _check(path: str, controllers: tuple[ControllerConfig, ...]) -> None:
