@@ -39,12 +39,20 @@ class Commands:
 
     positions : (n, k) in the order of ``machine.letters`` [m] or [rad], rotary axes unwrapped
     notes : what a person should know: axes out of their range
+    lines : (n,) of the file that each point is from, counted from 1; empty where there is none
     """
 
     machine: Machine
     feature: Feature
     positions: np.ndarray
     notes: tuple[str, ...] = ()
+    lines: tuple[int, ...] = ()
+
+    def where(self, row: int) -> str:
+        """What a person finds a point by."""
+        if self.lines:
+            return f'{self.feature.name}:{self.lines[row]}'
+        return f'{self.feature.name}: point {row + 1}'
 
     def axis(self, name: str) -> np.ndarray:
         """(n,) positions of one axis."""
@@ -86,7 +94,7 @@ def command(
         positions = min(found, key=lambda positions: _misses(machine, positions, inside))
     else:
         positions = found[0 if solution == NEGATIVE else 1]
-    return Commands(machine, feature, positions, tuple(out_of_range(machine, positions)))
+    return Commands(machine, feature, positions, tuple(out_of_range(machine, positions).values()))
 
 
 def tool_axis(machine: Machine, positions: np.ndarray) -> np.ndarray:
@@ -99,15 +107,19 @@ def tool_axis(machine: Machine, positions: np.ndarray) -> np.ndarray:
     return axis
 
 
-def out_of_range(machine: Machine, positions: np.ndarray) -> list[str]:
-    """Axes that leave their range, in words."""
-    notes = []
+def out_of_range(machine: Machine, positions: np.ndarray) -> dict[str, str]:
+    """Axes that leave their range, and that in words."""
+    notes = {}
     for name, column in zip(machine.letters, positions.T, strict=True):
         axis = machine.axes[name]
         scale, unit = (180.0 / np.pi, 'deg') if axis.rotary else (1e3, 'mm')
-        if column.min() < axis.lower - 1e-9 or column.max() > axis.upper + 1e-9:
-            notes.append(
-                f'{name} goes from {column.min() * scale:.1f} to {column.max() * scale:.1f} '
+        low, high = column.min(), column.max()
+        beyond = max(axis.lower - low, high - axis.upper)
+        if beyond > 1e-9:
+            # What is little too much must be seen.
+            digits = 1 if beyond * scale > 0.1 else 4
+            notes[name] = (
+                f'{name} goes from {low * scale:.{digits}f} to {high * scale:.{digits}f} '
                 f'{unit}, its range is {axis.lower * scale:g} to {axis.upper * scale:g}: the '
                 'machine cannot run this path as it is placed'
             )
@@ -214,5 +226,5 @@ def _misses(
     machine: Machine, positions: np.ndarray, inside: Callable[[np.ndarray], np.ndarray] | None
 ) -> tuple[int, ...]:
     """How many rotary ranges are left, then how many points are not inside."""
-    rotary = sum(note.split()[0] in machine.rotary for note in out_of_range(machine, positions))
+    rotary = sum(name in machine.rotary for name in out_of_range(machine, positions))
     return (rotary, 0 if inside is None else int((~inside(positions)).sum()))

@@ -109,7 +109,8 @@ def _program(path: Path, text: str, machine: Machine, surface: str) -> Commands:
 def _commanded(
     machine: Machine, feature: Feature, positions: np.ndarray, notes: tuple[str, ...] = ()
 ) -> Commands:
-    return Commands(machine, feature, positions, (*notes, *out_of_range(machine, positions)))
+    beyond = out_of_range(machine, positions).values()
+    return Commands(machine, feature, positions, (*notes, *beyond))
 
 
 def _table(path: Path, text: str) -> tuple[dict[str, np.ndarray], list[int]]:
