@@ -41,10 +41,12 @@ class Blocks:
     """Cutting moves of a program (G1), all axes going straight from start to end.
 
     start, end : (m, k) in the order of ``machine.letters`` [m] or [rad]
+    line : (m,) of the program, counted from 1
     """
 
     start: np.ndarray
     end: np.ndarray
+    line: tuple[int, ...]
 
 
 def read_blocks(path: Path, text: str, machine: Machine) -> Blocks:
@@ -55,7 +57,7 @@ def read_blocks(path: Path, text: str, machine: Machine) -> Blocks:
     scale = {n: math.pi / 180 if machine.axes[n].rotary else 1e-3 for n in machine.letters}
     position: dict[str, float] = {}
     cutting: bool | None = None
-    found = []
+    found, at = [], []
     for number, words in executed(path, text):
         where = f'{path}:{number}'
         motion = [_MOTION[v] for letter, v in words if letter == 'G' and v in _MOTION]
@@ -88,10 +90,11 @@ def read_blocks(path: Path, text: str, machine: Machine) -> Blocks:
                         'with G0 first'
                     )
                 found.append((before, dict(position)))
+                at.append(number)
     if not found:
         raise UserError(f'{path}: no cutting move (G1)')
     ends = np.array([[[p[name] for name in machine.letters] for p in pair] for pair in found])
-    return Blocks(ends[:, 0], ends[:, 1])
+    return Blocks(ends[:, 0], ends[:, 1], tuple(at))
 
 
 def executed(path: Path, text: str) -> Iterator[tuple[int, list[tuple[str, float]]]]:

@@ -47,6 +47,7 @@ def prediction_as_dict(found: Prediction, cone: Frustum | None) -> dict[str, Any
         'profile_stddev': found.profile_stddev.tolist(),
         'motions': found.motions,
         'ranking': ranking_as_list(found.ranking),
+        'not_determined': list(found.unknown),
         'notes': list(found.notes),
     }
 
@@ -122,6 +123,8 @@ def summary(found: Prediction) -> str:
     )
     if form.zone is not None:
         text += f', minimum zone {form.zone * unit:.2f} µm, ball bar {form.bar * unit:.2f} µm'
+    if found.unknown:
+        text += f'; without {", ".join(found.unknown)}, not determined and in no value or U'
     return text
 
 

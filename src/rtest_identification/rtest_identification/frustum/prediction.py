@@ -65,6 +65,7 @@ class Prediction:
     varying : under all that is not constant (Fig. 6-9 b), to first order
     motions : form deviation by each error motion that is not constant, the largest first [m]; its
         components may cancel in part
+    unknown : errors that matter here and are not in any of these, uncertainties included
     """
 
     commands: Commands
@@ -79,6 +80,7 @@ class Prediction:
     motions: dict[str, float]
     ranking: tuple[Ranked, ...]
     notes: tuple[str, ...]
+    unknown: tuple[str, ...] = ()
 
 
 def form(commands: Commands, error: np.ndarray, cone: Frustum | None = None) -> Form:
@@ -119,6 +121,7 @@ def predict_form(commands: Commands, errors: Errors, cone: Frustum | None = None
         form(commands, errors.error - errors.constant_error, cone),
         _motions(commands, errors.parts),
         rank(commands, errors.parts, summed=True), (*commands.notes, *errors.notes),
+        errors.unknown,
     )
 
 
