@@ -31,6 +31,8 @@ _TURN = 2.0 * np.pi
 # Nearer to it than this, the tool axis is along the first rotary axis, whose position is then
 # anything; to rounding a direction is out of reach.
 _ALONG, _ROUNDING = 1e-9, 1e-12
+# Sine of the angle between them below which that axis turns fast: 5 deg.
+_POLE = np.sin(np.radians(5.0))
 
 
 @dataclass(frozen=True)
@@ -94,7 +96,8 @@ def command(
         positions = min(found, key=lambda positions: _misses(machine, positions, inside))
     else:
         positions = found[0 if solution == NEGATIVE else 1]
-    return Commands(machine, feature, positions, tuple(out_of_range(machine, positions).values()))
+    notes = (*out_of_range(machine, positions).values(), *near_pole(machine, feature, positions))
+    return Commands(machine, feature, positions, notes)
 
 
 def tool_axis(machine: Machine, positions: np.ndarray) -> np.ndarray:
@@ -124,6 +127,24 @@ def out_of_range(machine: Machine, positions: np.ndarray) -> dict[str, str]:
                 'machine cannot run this path as it is placed'
             )
     return notes
+
+
+def near_pole(machine: Machine, feature: Feature, positions: np.ndarray) -> list[str]:
+    """Where the tool comes so near to the axis next to the table that this must turn fast."""
+    (name, _), first, _ = _pair(machine)
+    sine = np.linalg.norm(np.cross(feature.axis, first), axis=1)
+    nearest = int(np.argmin(sine))
+    turn = np.abs(np.diff(positions[:, machine.letters.index(name)]))
+    way = np.linalg.norm(np.diff(feature.tip, axis=0), axis=1)
+    if sine[nearest] >= _POLE or not turn.any():
+        return []
+    rate = np.degrees(turn / np.maximum(way * 1e3, 1e-3)).max()
+    return [
+        f'at point {nearest + 1} the tool comes within {np.degrees(np.arcsin(sine[nearest])):.2g} '
+        f'deg of a pole (along {name}): {name} turns by up to {rate:.3g} deg per mm of path; '
+        'where that is faster than it can, the feed is not kept, and a small change of the path '
+        'changes the commands much'
+    ]
 
 
 def _pair(machine: Machine) -> tuple[tuple[str, str], np.ndarray, np.ndarray]:

@@ -109,7 +109,9 @@ def figures(found: Prediction) -> list[tuple[str, str, str, str]]:
 def lines(ranked: Sequence[Ranked], quantity: str) -> list[str]:
     """The errors that matter most, for a person."""
     told = [f'{quantity} by each error alone [µm]:']
-    told += [f'  {1e6 * one.alone:8.2f}  {one.name} ({one.size})' for one in ranked[:_PRINTED]]
+    for one in ranked[:_PRINTED]:
+        formula = f': {one.formula}' if one.formula else ''
+        told.append(f'  {1e6 * one.alone:8.2f}  {one.name} ({one.size}){formula}')
     rest = len(ranked) - _PRINTED
     return told + ([f'  and {rest} more in frustum.json'] if rest > 0 else [])
 

@@ -42,7 +42,8 @@ class Ranked:
     """What one error does to the form [m].
 
     alone : form deviation that it makes alone; without : that of all errors but this one, None
-    where there is no sum; standard : by 10 µm or 0.01 deg of it, None for what is no one number
+    where there is no sum; standard : by 10 µm or 0.01 deg of it, None for what is no one number;
+    formula : of an effect that its name does not say
     """
 
     name: str
@@ -51,6 +52,7 @@ class Ranked:
     without: float | None
     standard: float | None
     constant: bool
+    formula: str = ''
 
 
 @dataclass(frozen=True)
@@ -137,6 +139,7 @@ def rank(commands: Commands, parts: Sequence[Part], summed: bool = False) -> tup
             part.name, part.size, float(judge(part.deviation)),
             None if total is None else float(judge(total - part.deviation)),
             None if part.standard is None else float(judge(part.standard)), part.constant,
+            part.formula,
         )
         for part in parts
     ]

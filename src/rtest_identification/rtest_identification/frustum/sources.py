@@ -53,6 +53,7 @@ class Part:
     standard : (n,) the same for 10 µm or 0.01 deg of it; None for what is no single number
     constant : whether it is a location error or a squareness
     motion : the error motion that it is a component of; its own name where it is no component
+    formula : what an effect with a name like `coning/C.2` is
     """
 
     name: str
@@ -61,6 +62,7 @@ class Part:
     standard: np.ndarray | None
     constant: bool
     motion: str = ''
+    formula: str = ''
 
 
 @dataclass(frozen=True)
@@ -103,7 +105,10 @@ def of_sizes(commands: Commands) -> list[Part]:
             for shape in effect.grid
         ], axis=1)
         worst = columns[:, int(np.argmax(commands.feature.form_deviation(columns.T)))]
-        parts.append(Part(effect.key, _SIZES[effect.parameters[0].unit][1], worst, worst, False))
+        parts.append(Part(
+            effect.key, _SIZES[effect.parameters[0].unit][1], worst, worst, False,
+            formula=effect.formula,
+        ))
     return parts
 
 
