@@ -437,11 +437,13 @@ def test_mistakes_are_told_in_one_line(identification, tmp_path):
         (['--out', tmp_path / 'full'], 'is not empty'),
         (['--effects', 'e.yaml'], 'give the --model'),
         (['--plan', 'p.yaml', '--machine', 'm.yaml'], 'names the machine'),
-        (['--feed', '0'], 'positive'),
+        (['--path', 'p.csv', '--feed', '0'], 'positive'),
+        (['--path', far, '--feed', '500'], '--feed: is of a --path as CSV'),
+        (['--path', far, '--controller', 'iso'], '--controller: is of new programs'),
         (['--at', 'nan', '0', '0'], 'finite'),
         (['--at', '5000', '0', '0'], 'reaches none of these places'),
         (['--path', tmp_path / 'no.ngc'], 'cannot read'),
-        (['--path', far], 'outside the measured stations'),
+        (['--path', far], r'far\.ngc:2: B = 100, C = 0 deg is outside the measured stations of B'),
         (['--machine', config_path('head_table.yaml')], 'not an identification.json|is of mach'),
     ):
         with pytest.raises(UserError, match=match) as caught:

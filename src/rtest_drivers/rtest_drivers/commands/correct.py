@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 HELP = 'change commands so that the predicted error of a machine vanishes'
 CONTROLLERS = ('linuxcnc', 'iso')
+# Of the tool on the part [mm/min].
+_FEED = 1000.0
 
 
 @dataclass
@@ -71,9 +73,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         metavar=('X', 'Y', 'Z'),
                         help='place for the table, table frame, mm; may be repeated (default: '
                         'the spheres of --plan, else a cube of 200 mm)')
-    parser.add_argument('--controller', choices=CONTROLLERS, default='linuxcnc',
+    parser.add_argument('--controller', choices=CONTROLLERS,
                         help='dialect of new NC programs (default: linuxcnc)')
-    parser.add_argument('--feed', type=float, default=1000.0, metavar='MM/MIN',
+    parser.add_argument('--feed', type=float, metavar='MM/MIN',
                         help='of the tool on the part, for a --path as CSV (default: 1000)')
     parser.add_argument('--out', type=Path, metavar='DIR',
                         help='write to DIR, which must not hold anything yet (default: '
@@ -159,7 +161,12 @@ def _check(arguments: argparse.Namespace) -> None:
         raise UserError('--effects: give the --model that has them')
     if arguments.plan and arguments.machine:
         raise UserError('--machine: the session file of --plan names the machine')
-    if not 0.0 < arguments.feed < math.inf:
+    table = arguments.path and arguments.path.suffix.lower() == '.csv'
+    if arguments.feed is not None and not table:
+        raise UserError('--feed: is of a --path as CSV; a program has its own')
+    if arguments.controller and not (table or arguments.plan):
+        raise UserError('--controller: is of new programs, for a --plan or a --path as CSV')
+    if arguments.feed is not None and not 0.0 < arguments.feed < math.inf:
         raise UserError(f'--feed {arguments.feed:g}: expected a positive number of mm/min')
     if not all(math.isfinite(value) for row in arguments.at for value in row):
         raise UserError('--at: expected three finite numbers of mm')
@@ -186,7 +193,7 @@ def _corrected(arguments: argparse.Namespace) -> tuple[KnownErrors, _Made]:
             more = load_effects(arguments.effects, machine)
         known = of_model(load_model(arguments.model), machine, more)
     if config:
-        return known, _session(config, known, arguments.controller)
+        return known, _session(config, known, arguments.controller or CONTROLLERS[0])
     if arguments.path:
         return known, _path(arguments, known)
     return known, _Made()
@@ -223,9 +230,10 @@ def _path(arguments: argparse.Namespace, known: KnownErrors) -> _Made:
     path, made = arguments.path, _Made()
     if path.suffix.lower() == '.csv':
         commands = load_path(path, known.machine, inside=known.inside)
-        suffix = '.nc' if arguments.controller == 'iso' else '.ngc'
+        controller = arguments.controller or CONTROLLERS[0]
+        suffix = '.nc' if controller == 'iso' else '.ngc'
         found = program.path_program(
-            commands, known, arguments.feed / 6e4, arguments.controller
+            commands, known, (arguments.feed or _FEED) / 6e4, controller
         )
     else:
         try:
