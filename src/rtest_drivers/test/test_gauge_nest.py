@@ -30,6 +30,7 @@ from rtest_drivers.sim.gauge_devices import (
     Mux10,
     Nd287,
 )
+from rtest_estimation.errors import UserError
 from rtest_estimation.records import GaugeBlock, Status
 
 NAMES = {
@@ -342,7 +343,7 @@ def test_a_port_in_use(cell) -> None:
 
 def test_an_unknown_kind_of_port(cell) -> None:
     cell.entry('keyence-lkg', 'foo://bar', 1)
-    with pytest.raises(ConnectionError, match=r'foo://bar: cannot be opened .*check the port'):
+    with pytest.raises(UserError, match=r"port: expected a device, .* got 'foo://bar'"):
         cell.nest()
 
 
