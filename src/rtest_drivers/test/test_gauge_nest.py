@@ -340,12 +340,6 @@ def test_a_port_in_use(cell) -> None:
     assert found.health()[0] == ''
 
 
-def test_an_unknown_kind_of_port(cell) -> None:
-    cell.entry('keyence-lkg', 'foo://bar', 1)
-    with pytest.raises(ConnectionError, match=r'foo://bar: cannot be opened .*check the port'):
-        cell.nest()
-
-
 def test_left_in_the_set_up_mode(cell) -> None:
     device = cell.add(Lkg(lambda: [0.0]), 1)
     device.emulator.measuring = False
