@@ -276,7 +276,10 @@ def _resident():
 
 
 def _peak():
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    # Not getrusage, which begins with that of the process that started this one.
+    (line,) = (line for line in Path('/proc/self/status').read_text().splitlines()
+               if line.startswith('VmHWM'))
+    return int(line.split()[1]) * 1024
 
 
 if __name__ == '__main__':

@@ -15,7 +15,7 @@ import pytest
 import serial.rfc2217
 
 from rtest_drivers.gauges import controller
-from rtest_drivers.gauges.check import check_nest
+from rtest_drivers.gauges.check import check_controllers
 from rtest_drivers.gauges.config import load_nest
 from rtest_drivers.gauges.frames import Line
 from rtest_drivers.gauges.nest import SerialNest
@@ -481,7 +481,7 @@ def test_check_of_a_nest(cell) -> None:
     cell.add(Nd287(lambda: [2.5e-4]), 1, ', rate_hz: 20, sign: -1')
     silent = cell.add(Nd287(lambda: [0.0]), 1)
     silent.fault = 'silent'
-    laser, display, dead = check_nest(load_nest(cell.path), 1.0)
+    laser, display, dead = check_controllers(load_nest(cell.path).controllers, 1.0)
     assert (laser.problem, display.problem) == ('', '')
     assert laser.rate == pytest.approx(100.0, rel=0.05)
     assert (laser.wanted_rate, display.unit, laser.limits) == (100.0, 'mm', (-1e-3, 1e-3))

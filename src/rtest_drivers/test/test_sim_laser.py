@@ -273,7 +273,8 @@ def test_the_cell_reads_what_its_laser_nest_reads(tmp_path):
     (nest,) = cell._nests
     assert len(nest.beams) == 3 and nest.radius == 25e-3
     # At the very end the sphere stands at the start of the plan but for the machine's errors.
-    sphere = cell._sphere(cell._timeline.at(np.array([cell.run.end])).positions)
+    end = np.array([cell.run.end])
+    sphere = cell._sphere(cell._timeline.at(end).positions, end)
     expected, _ = nest.measure(sphere, np.zeros((1, 3)))
     np.testing.assert_allclose(values[-1], expected[0], rtol=0, atol=1e-12)
     assert (status[-1] == Status.VALID).all()

@@ -30,8 +30,9 @@ def read_yaml(path: Path | str, what: str) -> Any:
     try:
         with Path(path).open('rb') as file:
             text = file.read(MAX_SIZE + 1).decode('utf-8')
-    except (OSError, UnicodeDecodeError) as error:
-        raise UserError(f'{path}: cannot read {what}: {error}') from None
+    # Also where the path is none, with a null character.
+    except (OSError, ValueError) as error:
+        raise UserError(f'{path!s}: cannot read {what}: {error}'.replace('\0', '?')) from None
     return load_yaml(text, str(path))
 
 
@@ -44,6 +45,9 @@ def load_yaml(text: str, where: str) -> Any:
         raise UserError(f'{where}: larger than {MAX_SIZE} bytes, expected a file for people')
     try:
         return _Loader(text).get_single_data()
+    # The constructors let these through where a value is not what its tag says.
+    except (KeyError, AttributeError):
+        raise UserError(f'{where}: not valid YAML: a value that its tag does not fit') from None
     # The scanner and the constructors let these through for escapes, dates and deep nesting.
     except (yaml.YAMLError, ValueError, OverflowError, RecursionError) as error:
         reason = ' '.join(str(error).split())[:200]

@@ -95,8 +95,10 @@ def load_machine(path: Path | str) -> Machine:
     path = Path(path)
     try:
         text = path.read_text(encoding='utf-8')
-    except (OSError, UnicodeDecodeError) as error:
-        raise UserError(f'{path}: cannot read the machine file: {error}') from None
+    # ValueError also where the path is none, with a null character.
+    except (OSError, ValueError) as error:
+        name = str(path).replace('\0', '?')
+        raise UserError(f'{name}: cannot read the machine file: {error}') from None
     return parse_machine(text, str(path))
 
 

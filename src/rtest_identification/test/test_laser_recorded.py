@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from rtest_estimation.columns import FeedbackColumns
 from rtest_estimation.errors import UserError
 from rtest_estimation.pipeline import EstimationRules
 from rtest_estimation.recording import Recording
@@ -49,11 +50,21 @@ def seen_from_below(positions):
     return reading, np.hypot(x, y) < LOST
 
 
+class Readings(tuple):
+    """Records of a recording that was made up."""
+
+    def pieces(self):
+        for one in self:
+            yield FeedbackColumns(one.axes, np.array([one.stamp]), one.position[None]) if (
+                isinstance(one, Feedback)
+            ) else one
+
+
 def recording(plans, stamps, positions, readings, status):
-    feedback = tuple(
+    feedback = Readings(
         Feedback(int(t), AXES, np.r_[p, 0.0, 0.0]) for t, p in zip(stamps, positions, strict=True)
     )
-    blocks = tuple(
+    blocks = Readings(
         GaugeBlock(int(stamps[k]), k, 1 / HZ, readings[k : k + 10], status[k : k + 10])
         for k in range(0, len(stamps), 10)
     )

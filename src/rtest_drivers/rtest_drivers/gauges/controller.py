@@ -129,8 +129,10 @@ class Controller:
         """One question and its answer; returns whether that was legal."""
         self.dropped += port.drop()
         self._framer.clear()
-        port.write(query.send)
+        # The question may be with the device before this thread goes on.
         asked = time.monotonic_ns()
+        port.write(query.send)
+        written = time.monotonic_ns()
         limit, first, heard = asked + round(self.config.timeout * 1e9), 0, b''
         while (now := time.monotonic_ns()) < limit:
             data = port.read((limit - now) * 1e-9)
@@ -147,7 +149,8 @@ class Controller:
                 else:
                     self.answers += 1
                     self._answered = time.monotonic()
-                    self._give(index, self._stamp(asked, first or time.monotonic_ns()), readings)
+                    stamp = self._stamp(asked, written, first or time.monotonic_ns())
+                    self._give(index, stamp, readings)
                     return True
         said = f'only {heard[-40:]!r}' if heard else 'nothing'
         text = f'{said} came within {self.config.timeout:g} s'
@@ -162,12 +165,12 @@ class Controller:
         self._resynchronise(port, self.config.timeout)
         return False
 
-    def _stamp(self, asked: int, first: int) -> tuple[int, float]:
-        """Stamp [ns] and its uncertainty [s]."""
+    def _stamp(self, asked: int, written: int, first: int) -> tuple[int, float]:
+        """Stamp [ns] and its uncertainty [s]; from the times about the question to the answer."""
         half = (first - asked) // 2
         latch = self.config.protocol.latch
         if latch is not None:
-            half = min(half, round(latch * 0.5e9))
+            half = min(half, (written - asked + round(latch * 1e9)) // 2)
         self.uncertainty = max(self.uncertainty, half * 1e-9)
         ago = time.monotonic_ns() - (asked + half)
         return self._clock.now() - ago, half * 1e-9
