@@ -30,6 +30,7 @@ setup(
             'recorder = rtest_drivers.nodes.recorder:main',
             'session = rtest_drivers.nodes.session:main',
             'cell = rtest_drivers.nodes.cell:main',
+            'view = rtest_drivers.nodes.view:main',
         ],
     },
 )

@@ -20,12 +20,13 @@ from rtest_drivers.commands import (
     plan,
     session,
     thermal,
+    view,
 )
 from rtest_drivers.graph import ONE_THREAD
 from rtest_drivers.runner import NodeFailed, Stopped
 from rtest_estimation.errors import UserError
 
-COMMANDS = (session, ask, demo, plan, identify, gap, thermal, frustum, correct, info)
+COMMANDS = (session, view, ask, demo, plan, identify, gap, thermal, frustum, correct, info)
 EXIT_FAILED, EXIT_USER, EXIT_INTERRUPTED, EXIT_PIPE = 1, 2, 130, 141
 
 

@@ -42,6 +42,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--moves', action='store_true',
                         help='with --check: MOVES each axis of a LinuxCNC by 1 mm or 1 deg and '
                         'back, and says which sign, unit or name is wrong')
+    parser.add_argument('--hold', action='store_true',
+                        help='every cycle waits for `rtest ask start`, or for the page')
+    parser.add_argument('--view', action='store_true',
+                        help='show the session on a page, at --host and --port')
+    parser.add_argument('--host', default='127.0.0.1', metavar='ADDRESS',
+                        help='of the page (default: 127.0.0.1, this computer only)')
+    parser.add_argument('--port', type=int, default=8090, metavar='N',
+                        help='of the page (default: 8090)')
     parser.add_argument('--remap', action='append', default=[], metavar='FROM:=TO',
                         help='remap a topic or service in all nodes; may be given several times')
     parser.add_argument('--namespace', default='', metavar='NS',
@@ -76,6 +84,8 @@ def run(arguments: argparse.Namespace) -> int:
         rate=arguments.rate,
         namespace=arguments.namespace,
         remaps=tuple(arguments.remap),
+        hold=arguments.hold,
+        view=(arguments.host, arguments.port) if arguments.view else None,
     )
     settings, complete = measure(settings, arguments.domain, bool(arguments.session))
     evaluate(settings, complete)

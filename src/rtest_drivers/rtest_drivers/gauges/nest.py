@@ -10,7 +10,7 @@ import numpy as np
 
 from rtest_drivers.clock import HostClock
 from rtest_drivers.gauges.align import Aligner, Sample
-from rtest_drivers.gauges.config import ControllerConfig, load_nest
+from rtest_drivers.gauges.config import ControllerConfig, load_nest, range_text
 from rtest_drivers.gauges.controller import Controller
 from rtest_estimation.records import GaugeBlock
 
@@ -127,6 +127,7 @@ class SerialNest:
             warnings.append(problem)
         return '; '.join(warnings), {
             **values,
+            'gauge_range_mm': range_text(self.config),
             'skew_mean_ms': f'{mean * 1e3:.2f}',
             'skew_max_ms': f'{largest * 1e3:.2f}',
         }

@@ -8,6 +8,7 @@ other messages by the middleware's word, and what the disk refused.
 from __future__ import annotations
 
 import re
+import shutil
 import signal
 import sys
 import time
@@ -66,6 +67,7 @@ CONTRACT: dict[str, tuple[type, QoSProfile]] = {
     'rtest/error_map': (ErrorMap, LATCHED_100),
     'rtest/model_gap': (ModelGap, LATCHED_100),
     'rtest/markers': (MarkerArray, LATCHED_100),
+    'rtest/mark': (String, LATCHED_100),
     '/diagnostics': (DiagnosticArray, STREAM),
 }
 DEFAULT_TOPICS = ['rtest/.*', '/diagnostics']
@@ -277,6 +279,7 @@ class Recorder(Node):
             'bytes': self.writer.size,
             'queued': self.writer.queued,
             'lost': self.lost,
+            'disk_free': shutil.disk_usage(self.writer.path.parent).free,
         }
         for name, check in self._checks.items():
             values[f'lost readings {name}'] = check.lost

@@ -3,7 +3,9 @@
 On a real machine somebody starts the NC program of each cycle, or the node does where the session
 file says `run_programs`. A cycle whose program ends before its last pose, as after an E-stop, is
 measured anew. The services `session/repeat` and `session/skip` (std_srvs/Trigger) measure it anew
-at any time, or go on with the next one.
+at any time, or go on with the next one. `session/calibrate` measures the nest of the set-up anew
+and then the cycle; `session/abort` ends the session with what there is. None of them stops the
+machine.
 
 Parameters
 ----------
@@ -12,6 +14,7 @@ session : name of the session
 simulated : whether the time comes from a simulated cell
 ready_timeout : how long the other nodes may take to appear [s]
 cycle_timeout : how long a cycle may take [s]; 0 is an estimate from its path
+hold : whether every cycle waits for the service `session/start`
 """
 
 from __future__ import annotations
@@ -20,6 +23,7 @@ import math
 import re
 import sys
 import time
+from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -78,6 +82,7 @@ ENDED_S = 5.0
 # The CNC driver tells its state as often, twice over [s].
 HEARD_S = 1.0
 REPEAT, SKIP = 'repeat', 'skip'
+START, CALIBRATE, ABORT = 'start', 'calibrate', 'abort'
 # What the CNC driver says where no NC program runs.
 IDLE = 'IDLE'
 
@@ -102,6 +107,7 @@ class SessionNode(Node):
         self.simulated = self.declare_parameter('simulated', False).value
         self.ready_timeout = self.declare_parameter('ready_timeout', 30.0).value
         self.cycle_timeout = self.declare_parameter('cycle_timeout', 0.0).value
+        self.hold = self.declare_parameter('hold', False).value
         config = self.declare_parameter('config', '').value
         self.config: SessionConfig = load_session(config)
         self._folder = Path(config).parent
@@ -119,7 +125,7 @@ class SessionNode(Node):
         }
         self._state = {name: self.create_client(GetState, f'{name}/get_state') for name in DRIVERS}
         self._finish = {name: self.create_client(Trigger, f'{name}/finish') for name in FINISHERS}
-        for wish in (REPEAT, SKIP):
+        for wish in (START, REPEAT, SKIP, CALIBRATE, ABORT):
             self.create_service(Trigger, f'~/{wish}', partial(self._on_wish, wish))
 
         self._spinner = SingleThreadedExecutor()
@@ -133,9 +139,10 @@ class SessionNode(Node):
         self._finished: dict[str, dict[str, str]] = {}
         self._complaints: dict[tuple[str, str], tuple[int, str]] = {}
         self._problems: list[str] = []
+        self._closing = False
         self._status = 'waiting for the other nodes'
         self._cycle_number = 0
-        self._wish = ''
+        self._wish = self._held = ''
         # What each driver last said, and the state of the NC program: since when it has not run.
         self._said: dict[str, str] = {}
         self._heard = 0
@@ -161,11 +168,21 @@ class SessionNode(Node):
         poses = sum(len(plan.commands) for plan in self.config.plans)
         self.say(f'{self.config.machine.name}: {len(self.config.plans)} cycles, {poses} poses')
         started = {}
-        for number, plan in enumerate(self.config.plans, 1):
-            self._cycle_number = number
-            measure = self._measure if self.simulated else self._measure_on_machine
-            started[plan.cycle] = measure(plan)
-        self._status = 'finishing'
+        left = deque(enumerate(self.config.plans, 1))
+        while left and self._wish != ABORT:
+            self._cycle_number, plan = left.popleft()
+            keys = started.setdefault(plan.cycle, [])
+            if self._may_start(plan):
+                measure = self._measure if self.simulated else self._measure_on_machine
+                keys += measure(plan)
+            if self._wish == CALIBRATE:
+                left.extendleft(self._calibration(self._cycle_number, plan))
+        if self._wish == ABORT:
+            names = dict.fromkeys(plan.cycle for _, plan in left)
+            self._problem('ended as was asked for' + (
+                f'; not measured: {", ".join(names)}' if names else ''
+            ))
+        self._status, self._closing = 'finishing', True
         self._close()
         self._judge(started)
         self._status = 'finished'
@@ -240,6 +257,27 @@ class SessionNode(Node):
         request = ChangeState.Request(transition=Transition(id=transition))
         return self._call(self._change[driver], request, f'{driver}/change_state').success
 
+    def _may_start(self, plan: CyclePlan) -> bool:
+        """Wait until the cycle is asked for, where the session holds; whether it is."""
+        self._wish = ''
+        if self.hold:
+            self._held, self._status = plan.cycle, f'{plan.cycle} waits to be started'
+            self._say_cycle(plan, '`rtest ask start` starts it')
+            self.wait(lambda: bool(self._wish), math.inf)
+            self._held = ''
+            if self._wish != START:
+                return False
+            self._wish = ''
+        return True
+
+    def _calibration(self, number: int, plan: CyclePlan) -> list[tuple[int, CyclePlan]]:
+        """The nest calibration of the cycle's set-up after the cycle itself: the last is next."""
+        again = [
+            (n, one) for n, one in enumerate(self.config.plans, 1)
+            if one.kind is Kind.NEST_CALIBRATION and one.setup == plan.setup
+        ]
+        return again if plan.kind is Kind.NEST_CALIBRATION else [(number, plan), *again]
+
     def _measure(self, plan: CyclePlan) -> list[tuple[str, int]]:
         """Publish one plan and wait for its finished cycle; returns its key.
 
@@ -255,7 +293,7 @@ class SessionNode(Node):
             if progress.clock_stands(now, wall) > CLOCK_TIMEOUT_S:
                 raise SessionError(f'{plan.cycle}: the clock has stood still for '
                                    f'{CLOCK_TIMEOUT_S:.0f} s; is the simulated cell running?')
-            if key in self._cycles:
+            if key in self._cycles or self._wish == ABORT:
                 break
             done, poses = self._progress(key)
             if why := progress.stopped(now, wall, done, self._feedback_age):
@@ -530,14 +568,25 @@ class SessionNode(Node):
     def _on_wish(
         self, wish: str, _: Trigger.Request, response: Trigger.Response
     ) -> Trigger.Response:
-        # A simulated cycle needs nobody.
-        response.success = bool(self._open) and not self.simulated
-        response.message = self._status
-        if response.success:
-            self._wish = wish
+        refused = self._refuses(wish)
+        response.success, response.message = not refused, self._status
+        if refused:
+            response.message += f'; {refused}'
         else:
-            response.message += '; there is nothing to repeat or skip'
+            self._wish = wish
         return response
+
+    def _refuses(self, wish: str) -> str:
+        """Why a wish cannot be granted; '' where it can."""
+        if wish == START:
+            return '' if self._held else 'no cycle waits to be started'
+        if self._held:
+            return 'there is nothing to repeat' if wish == REPEAT else ''
+        # A simulated cycle needs nobody, and goes on to its end before a calibration.
+        interrupts = wish in (REPEAT, SKIP)
+        if not self._open or self._closing or (interrupts and self.simulated):
+            return f'there is nothing to {"repeat or skip" if interrupts else wish}'
+        return ''
 
     def _diagnose(self) -> None:
         level = diagnostics.WARN if self._problems else diagnostics.OK
@@ -548,6 +597,7 @@ class SessionNode(Node):
             'cycle': self._cycle_number,
             'cycles': len(self.config.plans),
             'problems': len(self._problems),
+            'waits_for_start': self._held,
         }
         self._diagnostics.publish(diagnostics.status('session: progress', level, text, values))
 

@@ -1,0 +1,39 @@
+"""Show a running cell on a page: devices, gauges, poses, results, and its controls.
+
+Serves http://127.0.0.1:8090/ until Ctrl-C. Opening and closing the page, or this command, changes
+nothing in the session. With --host others on the network can look; who has the address that is
+printed, with its key, can also start, repeat, skip, calibrate, abort and mark.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+
+from rtest_drivers.domain import chosen_domain
+from rtest_drivers.graph import ros_arguments, view_node
+
+HELP = 'show a running cell on a page in the browser'
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Arguments of `rtest view`."""
+    parser.add_argument('--host', default='127.0.0.1', metavar='ADDRESS',
+                        help='address to serve at (default: 127.0.0.1, this computer only; '
+                        '0.0.0.0: every network it is in)')
+    parser.add_argument('--port', type=int, default=8090, metavar='N',
+                        help='port to serve at (default: 8090)')
+    parser.add_argument('--domain', type=int, metavar='N',
+                        help='ROS domain of the cell (default: ROS_DOMAIN_ID)')
+    parser.add_argument('--namespace', default='', metavar='NS', help='ROS namespace of the cell')
+    parser.add_argument('--remap', action='append', default=[], metavar='FROM:=TO',
+                        help='remap a topic or service; may be given several times')
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Serve the page until it is told to stop."""
+    from rtest_drivers.nodes.view import main
+
+    node = view_node(arguments.host, arguments.port)
+    os.environ['ROS_DOMAIN_ID'] = str(chosen_domain(False, arguments.domain))
+    return main(['--ros-args', *ros_arguments(node, arguments.namespace, arguments.remap)])
