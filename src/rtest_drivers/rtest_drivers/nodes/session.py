@@ -178,7 +178,8 @@ class SessionNode(Node):
             if self._wish == CALIBRATE:
                 left.extendleft(self._calibration(self._cycle_number, plan))
         if self._wish == ABORT:
-            names = dict.fromkeys(plan.cycle for _, plan in left)
+            names = [p.cycle for p in self.config.plans if not started.get(p.cycle)]
+            started = {cycle: keys for cycle, keys in started.items() if keys}
             self._problem('ended as was asked for' + (
                 f'; not measured: {", ".join(names)}' if names else ''
             ))
@@ -572,6 +573,8 @@ class SessionNode(Node):
         response.success, response.message = not refused, self._status
         if refused:
             response.message += f'; {refused}'
+        elif wish == START:
+            self._wish, response.message = wish, f'starting {self._held}'
         else:
             self._wish = wish
         return response

@@ -132,4 +132,8 @@ def node_health(reports: list[Report], ended: bool, now: float) -> Health:
         text = f'silent for {said:.1f} s: the process has ended or hangs'
         return Health(name, ERROR, text, None, said)
     worst = max(reports, key=lambda report: report.level)
-    return Health(name, _LEVELS[worst.level], worst.text, None, said)
+    # The identifier sums up what it found and has its warnings beside that.
+    text = worst.values.get('warning 1', worst.text)
+    more = sum(key.startswith('warning ') for key in worst.values) - 1
+    text += f' (and {more} more)' if more > 0 else ''
+    return Health(name, _LEVELS[worst.level], text, None, said)

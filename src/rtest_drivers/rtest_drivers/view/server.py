@@ -33,7 +33,8 @@ MARK_LIMIT = 200
 WISHES = ('start', 'repeat', 'skip', 'calibrate', 'abort')
 _TYPES = {'page.js': 'text/javascript', 'page.css': 'text/css', 'page.html': 'text/html'}
 _HEADERS = {
-    'Content-Security-Policy': "default-src 'self'; frame-ancestors 'none'; base-uri 'none'",
+    'Content-Security-Policy':
+        "default-src 'self'; img-src data:; frame-ancestors 'none'; base-uri 'none'",
     'X-Content-Type-Options': 'nosniff',
     'Referrer-Policy': 'no-referrer',
     'Cache-Control': 'no-store',

@@ -130,7 +130,10 @@ class IdentifierNode(Node):
 
     def _report(self) -> None:
         warnings = self._result.warnings if self._result else ()
-        level = diagnostics.WARN if warnings or self._problem else diagnostics.OK
+        # Waiting is no fault, what cannot be identified is.
+        static = any(c.plan.kind is Kind.STATIC for c in self._cycles)
+        wrong = warnings or (self._problem and (static or self._machine is None))
+        level = diagnostics.WARN if wrong else diagnostics.OK
         values = {f'warning {n + 1}': text for n, text in enumerate(warnings)}
         self._diagnostics.publish(
             diagnostics.status('identifier: session', level, self._summary(), values)

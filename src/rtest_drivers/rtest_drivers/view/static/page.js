@@ -7,7 +7,6 @@ const KEY = document.querySelector('meta[name=rtest-key]').content || location.h
 const WORDS = {ok: 'OK', warn: 'WARNING', error: 'ERROR', idle: 'IDLE'};
 // Colour-blind safe (Okabe and Ito 2008), each with a dash of its own.
 const COLOURS = ['#0072B2', '#D55E00', '#007a5a', '#a0457f', '#7a6200', '#56B4E9'];
-const DASHES = [[], [8, 4], [2, 3], [10, 3, 2, 3], [5, 5], [1, 2]];
 const HISTORY_S = 60;
 // Values are old when nothing came for this long [ms].
 const LOST_MS = 1500;
@@ -15,7 +14,7 @@ const LOST_MS = 1500;
 let live = null, heard = 0, drawn = true;
 let strip = [];
 const parts = {};
-let shownCycle = null, shownPose = null, stripOf = 'gauges', plane = '3-D';
+let shownCycle = null, shownPose = null, stripOf = 'gauges', plane = '3-D', shownLevel = '';
 let turn = {azimuth: -0.6, height: 0.45};
 
 function element(tag, className, text) {
@@ -37,8 +36,11 @@ function rows(parent, count, make) {
   return [...parent.children];
 }
 
-const number = (value, digits) =>
-  value === null || value === undefined ? '–' : value.toFixed(digits).replace('-', '−');
+function number(value, digits) {
+  if (value === null || value === undefined) return '–';
+  const text = value.toFixed(digits);
+  return Number(text) === 0 ? text.replace('-', '') : text.replace('-', '−');
+}
 
 // ---- what comes ----
 
@@ -289,8 +291,6 @@ function legend(id, names) {
   });
   names.forEach((name, index) => {
     made[index].firstChild.style.borderColor = COLOURS[index % COLOURS.length];
-    made[index].firstChild.style.borderTopStyle =
-      ['solid', 'dashed', 'dotted'][index % 3];
     set(made[index].lastChild, name);
   });
 }
@@ -312,7 +312,7 @@ function drawStrip() {
     context.fillText('no valid values in the last 60 seconds', 20, 90);
     return;
   }
-  const box = {left: 62, right: wide - 6, top: 22, bottom: 166};
+  const box = {left: 62, right: wide - 34, top: 22, bottom: 166};
   const at = frame(context, box, ends[0], ends[1], 'µm, full scale follows the values');
   const x = (t) => box.right - (live.t - t) / HISTORY_S * (box.right - box.left);
   context.textAlign = 'center';
@@ -325,7 +325,6 @@ function drawStrip() {
   names.forEach((_, index) => {
     context.strokeStyle = COLOURS[index % COLOURS.length];
     context.lineWidth = 1.8;
-    context.setLineDash(gauges ? [] : DASHES[index]);
     context.beginPath();
     let before = null;
     for (const row of strip) {
@@ -338,6 +337,26 @@ function drawStrip() {
       else before = null;
     }
     context.stroke();
+  });
+  nameLines(context, box, names.map((name, index) => {
+    const one = strip.length ? span(strip[strip.length - 1], index) : null;
+    return one && {name: name.replace('gauge ', ''), y: at(one[1]), colour: COLOURS[index]};
+  }).filter((one) => one));
+}
+
+// Names beside the ends of the lines, apart enough to be read: no line is told by colour alone.
+function nameLines(context, box, ends) {
+  const apart = 17, room = (ends.length - 1) * apart;
+  ends.sort((a, b) => a.y - b.y);
+  let y = -Infinity;
+  context.textAlign = 'left';
+  context.textBaseline = 'middle';
+  context.font = 'bold 15px system-ui, sans-serif';
+  ends.forEach((one, index) => {
+    const lowest = box.bottom - room + index * apart;
+    y = Math.max(y + apart, Math.min(one.y, lowest));
+    context.fillStyle = one.colour;
+    context.fillText(one.name, box.right + 8, y);
   });
 }
 
@@ -506,7 +525,9 @@ function drawPicture() {
   const [context, wide] = prepared(byId('picture'), 440);
   const note = markers.find((one) => one.group === 'magnification');
   set(byId('picture-factor'), note ? note.text : '');
-  const lines = markers.filter((one) => one.points.length);
+  chooseLevel([...new Set(markers.filter((one) => one.points.length).map((one) => one.text))]);
+  const lines = markers.filter((one) => one.points.length &&
+    (!shownLevel || one.text === shownLevel));
   const all = lines.flatMap((one) => one.points);
   if (!all.length) return;
   const project = projector(all), flat = all.map(project);
@@ -552,6 +573,17 @@ function drawPicture() {
   setups.forEach((one, index) => {
     made[index].firstChild.style.borderColor = one.colour;
     set(made[index].lastChild, `sphere ${one.name}`);
+  });
+}
+
+// One level of the stepping axis, or all of them.
+function chooseLevel(levels) {
+  if (!levels.includes(shownLevel)) shownLevel = '';
+  const names = levels.length > 1 ? ['', ...levels] : [];
+  const made = rows(byId('level-choice'), names.length, () => element('button'));
+  names.forEach((name, index) => {
+    set(made[index], name || 'all', name === shownLevel ? 'chosen' : '');
+    made[index].onclick = () => { shownLevel = name; drawPicture(); };
   });
 }
 
@@ -601,7 +633,12 @@ function drawMaps() {
     const over = map.levels.length ? `over ${map.axis}, one line for each station of the other ` +
       'rotary axis' : `over ${map.axis}`;
     byId('maps').append(element('h3', '', `Axis ${map.axis}: ${over}`));
-    for (const one of map.symbols) {
+    const open = map.symbols.filter((one) => one.lines.flat().every((value) => value === null));
+    if (open.length) {
+      byId('maps').append(element('p', 'quiet', 'Not determined by these poses: ' +
+        open.map((one) => one.symbol).join(', ')));
+    }
+    for (const one of map.symbols.filter((other) => !open.includes(other))) {
       const figure = element('figure'), canvas = element('canvas');
       figure.append(element('figcaption', '', `${one.symbol} [${one.unit}]`), canvas);
       byId('maps').append(figure);
@@ -616,11 +653,6 @@ function drawMap(canvas, map, one) {
     value === null ? [] : map.levels.length ? [value] :
       [value - (one.U[n][k] || 0), value + (one.U[n][k] || 0)]));
   const ends = limits([0, ...values]);
-  if (!values.length) {
-    context.fillStyle = '#56616c';
-    context.fillText('not determined by these poses', 20, 75);
-    return;
-  }
   const box = {left: 48, right: wide - 8, top: 12, bottom: 126};
   const at = frame(context, box, ends[0], ends[1], '');
   const low = Math.min(...map.over), high = Math.max(...map.over);
