@@ -124,6 +124,7 @@ def test_silence_after_the_end_of_a_session_is_no_fault() -> None:
     run(state, 0.0, 2.0)
     state.add_report(Report('session: progress', 0, 'finished', {'state': 'finished'}, 2.0))
     assert device(state, 60.0)['level'] == 'idle'
+    assert {(g['level'], g['text']) for g in state.tick(60.0)['gauges']} == {('idle', 'old value')}
     assert device(state, 60.0, 'session')['level'] == 'idle'
 
 

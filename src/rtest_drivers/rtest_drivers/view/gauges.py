@@ -60,18 +60,18 @@ class Gauges:
         self._low = self._high = np.full(self._value.shape, np.nan)
         return spans
 
-    def shown(self, alive: bool) -> list[dict[str, Any]]:
+    def shown(self, device: str) -> list[dict[str, Any]]:
         """Value [µm], range [µm] or None, level and state in words of each gauge.
 
-        alive : whether the values are of now
+        device : level of the gauge driver; its values are of now where it is ok or warned of
         """
         idle = bool((self._status == Status.NO_SIGNAL).all())
         rows = []
         for index, (value, status) in enumerate(zip(self._value, self._status, strict=True)):
             limits = self.ranges[index] if index < len(self.ranges) else None
             level, text = _judge(float(value), int(status), limits, idle)
-            if not alive:
-                level, text = ERROR, 'old value'
+            if device not in (OK, WARN):
+                level, text = device, 'old value'
             rows.append({
                 'name': f'gauge {index + 1}',
                 'value': round(float(value) * 1e6, 3) if math.isfinite(value) else None,

@@ -108,8 +108,8 @@ def _cells(
         for b, c in zip(outer, inner, strict=True)
     ]
     return (
-        [f'{rotary[0]} {value:g}°' for value in rows],
-        [f'{rotary[1]} {value:g}°' for value in columns],
+        [f'{rotary[0]} {_number(value)}°' for value in rows],
+        [f'{rotary[1]} {_number(value)}°' for value in columns],
         places,
         names,
     )
@@ -118,5 +118,10 @@ def _cells(
 def _position(axis: str, value: float, machine: Machine | None) -> str:
     turns = axis == 'S' or (machine is not None and machine.axes[axis].rotary)
     if turns:
-        return f'{axis} {math.degrees(value):.6g}°'
-    return f'{axis} {value * 1e3:.6g} mm'
+        return f'{axis} {_number(math.degrees(value))}°'
+    return f'{axis} {_number(value * 1e3)} mm'
+
+
+def _number(value: float) -> str:
+    """As a person writes it, with a minus sign."""
+    return f'{round(value, 4) + 0.0:.6g}'.replace('-', '−')

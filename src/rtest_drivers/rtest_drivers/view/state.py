@@ -145,7 +145,6 @@ class CellState:
         ended = self._ended()
         gauges = self._health('gauges', ended, now)
         cnc = self._health('cnc', ended, now)
-        alive = gauges.level in (OK, WARN)
         sphere = self._sphere(now)
         row = {'t': round(now, 3), 'spans': self._gauges.spans(), 'sphere': sphere}
         self.history.append(row)
@@ -155,7 +154,7 @@ class CellState:
             'devices': [
                 _row(one) for one in (gauges, cnc, *self._thermometers(ended, now))
             ] + [_row(one) for one in self._nodes(ended, now)],
-            'gauges': self._gauges.shown(alive),
+            'gauges': self._gauges.shown(gauges.level),
             'axes': self._axes(cnc.level in (OK, WARN)),
             'recording': self._recording(),
         }

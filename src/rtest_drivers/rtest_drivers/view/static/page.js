@@ -179,7 +179,7 @@ function drawAxes() {
     bar.style.visibility = one.range ? 'visible' : 'hidden';
     if (one.range) drawBar(bar, one.value, one.range);
     set(value.firstChild, number(one.value, 4), one.alive ? 'figure' : 'figure old');
-    set(value.lastChild, one.unit === '°' ? '°' : ` ${one.unit}`);
+    set(value.lastChild, (one.unit === '°' ? '°' : ` ${one.unit}`) + (one.alive ? '' : ' old'));
   });
 }
 
@@ -407,7 +407,7 @@ function drawGrid(grid, one, name) {
     const wide = Math.max(...one.places.map((place) => place[1])) + 1;
     const labelled = one.rows.length > 0;
     grid.style.gridTemplateColumns =
-      (labelled ? 'max-content ' : '') + `repeat(${wide}, minmax(30px, 1fr))`;
+      (labelled ? 'max-content ' : '') + `repeat(${wide}, minmax(26px, 1fr))`;
     if (labelled) {
       grid.append(element('span'));
       for (const text of one.columns) grid.append(element('span', '', text));
@@ -488,8 +488,10 @@ function drawLocation() {
   const line = element('p', '', 'Model against measurement: ');
   line.append(element('span', `badge ${level}`, gap.verdict));
   box.append(line);
-  box.append(element('p', 'quiet', `Left by the model ${number(gap.before, 2)} µm, ` +
-    `with the effects below ${number(gap.after, 2)} µm, noise ${number(gap.noise, 2)} µm (rms).`));
+  const after = gap.effects.length ?
+    `; with the effects below ${number(gap.after, 2)} µm` : '; no known effect was added';
+  box.append(element('p', 'quiet', `The model leaves ${number(gap.before, 2)} µm, of which ` +
+    `${number(gap.noise, 2)} µm are noise${after} (rms).`));
   const list = element('ul');
   for (const one of gap.effects) {
     const others = one.rivals ? `; cannot be told from ${one.rivals}` : '';
