@@ -26,6 +26,8 @@ LOGS = 'log'
 INCOMPLETE = 3
 # Simulated seconds per second at which nodes on two processor cores lose nothing.
 RATE = 10.0
+# Where the page is served: on this computer only.
+VIEW_HOST, VIEW_PORT = '127.0.0.1', 8090
 # The problems are small: more threads than one are slower, and not bit for bit repeatable.
 ONE_THREAD = {'OMP_NUM_THREADS': '1', 'OPENBLAS_NUM_THREADS': '1'}
 

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 
 from rtest_drivers.config import config_path
 from rtest_drivers.domain import held_domain
-from rtest_drivers.graph import RATE, GraphSettings, session_name
+from rtest_drivers.graph import RATE, VIEW_HOST, VIEW_PORT, GraphSettings, session_name
 from rtest_drivers.runner import NodeFailed, Stopped, run_session
 from rtest_estimation.errors import UserError
 
@@ -46,10 +46,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         help='every cycle waits for `rtest ask start`, or for the page')
     parser.add_argument('--view', action='store_true',
                         help='show the session on a page, at --host and --port')
-    parser.add_argument('--host', default='127.0.0.1', metavar='ADDRESS',
+    parser.add_argument('--host', default=VIEW_HOST, metavar='ADDRESS',
                         help='of the page (default: 127.0.0.1, this computer only)')
-    parser.add_argument('--port', type=int, default=8090, metavar='N',
-                        help='of the page (default: 8090)')
+    parser.add_argument('--port', type=int, default=VIEW_PORT, metavar='N',
+                        help=f'of the page (default: {VIEW_PORT})')
     parser.add_argument('--remap', action='append', default=[], metavar='FROM:=TO',
                         help='remap a topic or service in all nodes; may be given several times')
     parser.add_argument('--namespace', default='', metavar='NS',

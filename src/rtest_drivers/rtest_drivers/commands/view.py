@@ -11,18 +11,18 @@ import argparse
 import os
 
 from rtest_drivers.domain import chosen_domain
-from rtest_drivers.graph import ros_arguments, view_node
+from rtest_drivers.graph import VIEW_HOST, VIEW_PORT, ros_arguments, view_node
 
 HELP = 'show a running cell on a page in the browser'
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of `rtest view`."""
-    parser.add_argument('--host', default='127.0.0.1', metavar='ADDRESS',
+    parser.add_argument('--host', default=VIEW_HOST, metavar='ADDRESS',
                         help='address to serve at (default: 127.0.0.1, this computer only; '
                         '0.0.0.0: every network it is in)')
-    parser.add_argument('--port', type=int, default=8090, metavar='N',
-                        help='port to serve at (default: 8090)')
+    parser.add_argument('--port', type=int, default=VIEW_PORT, metavar='N',
+                        help=f'port to serve at (default: {VIEW_PORT})')
     parser.add_argument('--domain', type=int, metavar='N',
                         help='ROS domain of the cell (default: ROS_DOMAIN_ID)')
     parser.add_argument('--namespace', default='', metavar='NS', help='ROS namespace of the cell')

@@ -57,6 +57,7 @@ from rtest_identification.session_file import (
     SessionConfig,
     load_session,
 )
+from rtest_identification.urdf import describe
 
 DRIVERS = ('gauges', 'cnc')
 # Who must not miss the first reading.
@@ -115,6 +116,7 @@ class SessionNode(Node):
         self._host = HostClock()
 
         self._machine = self.create_publisher(String, 'rtest/machine', LATCHED)
+        self._description = self.create_publisher(String, 'robot_description', LATCHED)
         self._plans = self.create_publisher(CyclePlanMessage, 'rtest/plan', LATCHED_100)
         self._diagnostics = diagnostics.Diagnostics(self)
         self.create_subscription(Cycle, 'rtest/cycle', self._on_cycle, LATCHED_100)
@@ -158,6 +160,7 @@ class SessionNode(Node):
         """
         self._wait_for_nodes()
         self._machine.publish(String(data=self.config.machine.text))
+        self._description.publish(String(data=describe(self.config)))
         for name in DRIVERS:
             self._bring_to(name, State.PRIMARY_STATE_INACTIVE)
         self._wait_for_listeners()

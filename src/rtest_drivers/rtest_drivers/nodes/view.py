@@ -31,9 +31,10 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
+from rtest_drivers.graph import VIEW_HOST, VIEW_PORT
 from rtest_drivers.view import results
 from rtest_drivers.view.devices import Report
-from rtest_drivers.view.server import LOCALHOST, PORT, WISHES, Server, serve
+from rtest_drivers.view.server import WISHES, Server, serve
 from rtest_drivers.view.state import CellState
 from rtest_estimation import messages
 from rtest_estimation.errors import UserError
@@ -58,8 +59,8 @@ class ViewNode(Node):
 
     def __init__(self) -> None:
         super().__init__('view')
-        self.host = self.declare_parameter('host', LOCALHOST).value
-        self.port = self.declare_parameter('port', PORT).value
+        self.host = self.declare_parameter('host', VIEW_HOST).value
+        self.port = self.declare_parameter('port', VIEW_PORT).value
         self.state = CellState()
         # Callbacks so far, by which `look` sees that nothing is left.
         self.handled = 0

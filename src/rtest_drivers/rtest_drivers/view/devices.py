@@ -15,6 +15,9 @@ _LEVELS = (OK, WARN, ERROR, ERROR)
 _INTERVALS, _SHORTEST_S = 5.0, 1.0
 # The drivers say how they are twice a second, the other nodes once a second [s].
 _DRIVER_SILENT_S, _NODE_SILENT_S = 1.5, 3.0
+# A node that computes says nothing meanwhile: so long it may be busy [s].
+_BUSY_S = {'identifier': 120.0}
+_LONGEST_BUSY_S = 10.0
 # The rate is that of the last so many seconds.
 _RATE_S = 2.0
 _DRIVER = re.compile(r'(.+): driver')
@@ -129,7 +132,9 @@ def node_health(reports: list[Report], ended: bool, now: float) -> Health:
     if ended:
         return Health(name, IDLE, 'ended with the session', None, said)
     if said > _NODE_SILENT_S:
-        text = f'silent for {said:.1f} s: the process has ended or hangs'
+        if said <= _BUSY_S.get(name, _LONGEST_BUSY_S):
+            return Health(name, WARN, f'busy: silent for {said:.0f} s', None, said)
+        text = f'silent for {said:.0f} s: the process has ended or hangs'
         return Health(name, ERROR, text, None, said)
     worst = max(reports, key=lambda report: report.level)
     # The identifier sums up what it found and has its warnings beside that.

@@ -25,8 +25,6 @@ from aiohttp import web
 from rtest_drivers.view.state import TICK_S, CellState
 from rtest_estimation.errors import UserError
 
-LOCALHOST = '127.0.0.1'
-PORT = 8090
 KEY_HEADER = 'X-Rtest-Key'
 MARK_LIMIT = 200
 # What a person can ask of a session, as services `session/NAME`.
@@ -53,7 +51,7 @@ class Server:
     mark : puts a text into the recording; (done, answer)
     """
 
-    def __init__(self, state: CellState, ask: Ask, mark: Mark, host: str = LOCALHOST) -> None:
+    def __init__(self, state: CellState, ask: Ask, mark: Mark, host: str) -> None:
         self._state, self._ask, self._mark = state, ask, mark
         self.host = host
         self.key = secrets.token_urlsafe(16)

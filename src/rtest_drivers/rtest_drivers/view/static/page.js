@@ -330,16 +330,16 @@ function drawStrip() {
     for (const row of strip) {
       const one = span(row, index);
       // A gap stays a gap: nothing is drawn across it.
-      if (!one || before === null || row.t - before > 0.5) {
-        if (one) context.moveTo(x(row.t), at(one[0]));
-      } else context.lineTo(x(row.t), at(one[0]));
-      if (one) { context.lineTo(x(row.t), at(one[1])); before = row.t; }
-      else before = null;
+      if (!one) continue;
+      if (before === null || row.t - before > 0.5) context.moveTo(x(row.t), at(one[0]));
+      else context.lineTo(x(row.t), at(one[0]));
+      context.lineTo(x(row.t), at(one[1]));
+      before = row.t;
     }
     context.stroke();
   });
   nameLines(context, box, names.map((name, index) => {
-    const one = strip.length ? span(strip[strip.length - 1], index) : null;
+    const one = strip.slice(-5).map((row) => span(row, index)).filter((s) => s).pop();
     return one && {name: name.replace('gauge ', ''), y: at(one[1]), colour: COLOURS[index]};
   }).filter((one) => one));
 }
