@@ -19,8 +19,8 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 
 from rtest_estimation.errors import UserError
 
-# Time in which the nodes of a graph are found [s].
-_FIND_S = 1.5
+# A graph is found when nothing new has appeared for so long, or it is time to look [s].
+_QUIET_S, _LONGEST_S = 1.5, 8.0
 # Of a long array so many elements are printed.
 _SHOWN = 24
 
@@ -66,7 +66,7 @@ class Looker:
 
     def __init__(self, node: Node, executor: SingleThreadedExecutor) -> None:
         self._node, self._executor = node, executor
-        self._spin(_FIND_S)
+        self._find()
 
     def topics(self) -> list[Topic]:
         """Every topic of the graph that somebody else publishes or listens to."""
@@ -102,6 +102,15 @@ class Looker:
             while texts and (not count or printed < count):
                 printed += 1
                 yield texts.pop(0)
+
+    def _find(self) -> None:
+        """Wait until the graph has been found."""
+        start = changed = time.monotonic()
+        seen: list[Topic] = []
+        while (now := time.monotonic()) - start < _LONGEST_S and now - changed < _QUIET_S:
+            self._spin(0.1)
+            if (found := self.topics()) != seen:
+                seen, changed = found, now
 
     def _spin(self, seconds: float) -> None:
         end = time.monotonic() + seconds
