@@ -11,6 +11,7 @@ from typing import NoReturn
 
 from rtest_drivers.commands import (
     ask,
+    check,
     correct,
     demo,
     frustum,
@@ -27,7 +28,9 @@ from rtest_drivers.graph import ONE_THREAD
 from rtest_drivers.runner import NodeFailed, Stopped
 from rtest_estimation.errors import UserError
 
-COMMANDS = (session, view, ask, topics, demo, plan, identify, gap, thermal, frustum, correct, info)
+COMMANDS = (
+    session, check, view, ask, topics, demo, plan, identify, gap, thermal, frustum, correct, info,
+)
 EXIT_FAILED, EXIT_USER, EXIT_INTERRUPTED, EXIT_PIPE = 1, 2, 130, 141
 
 

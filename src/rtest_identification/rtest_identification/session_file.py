@@ -20,6 +20,7 @@ from rtest_identification.moves import Approach, Speeds
 from rtest_identification.plan_check import Spindle, Table
 from rtest_identification.plans import (
     UNEVEN_DEG,
+    check,
     check_ranges,
     diagnostic,
     nest_calibration,
@@ -28,7 +29,7 @@ from rtest_identification.plans import (
 )
 from rtest_identification.session_reader import Reader
 
-STATIC, DIAGNOSTIC = 'static', 'diagnostic'
+STATIC, DIAGNOSTIC, CHECK = 'static', 'diagnostic', 'check'
 # Fewer do not tell offset, sine and cosine of an error over the axis from each other.
 FEWEST_STATIONS = 3
 # Closer ones are one pose for the machine and for who looks for its stops.
@@ -40,7 +41,7 @@ _RADIUS_MM = (1.0, 100.0)
 # Six points tell a circle from noise.
 _RUNOUT_STATIONS = (6, 360)
 _NAME = re.compile(r'[A-Za-z0-9][A-Za-z0-9._-]*')
-_BUILD = {STATIC: static, DIAGNOSTIC: diagnostic}
+_BUILD = {STATIC: static, DIAGNOSTIC: diagnostic, CHECK: check}
 _KEYS = {
     'machine', 'sphere_radius_mm', 'cycle', 'nest_calibration', 'spindle_runout', 'setups',
     'moves', 'table', 'spindle', 'devices',
@@ -71,7 +72,7 @@ class SessionConfig:
 
     sphere_radius : [m]
     plans : in order, each with stamp 0 and an empty session name until it is started
-    kind : of the cycle, 'static' or 'diagnostic'
+    kind : of the cycle, 'static', 'diagnostic' or 'check'
     stations : of each rotary axis [rad], outer one first
     speeds, approach : how the axes move between poses, and to the first pose
     table, spindle : bodies that must not touch; None where the file says nothing of them
