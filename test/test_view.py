@@ -258,7 +258,7 @@ def test_results_and_missing_poses_are_shown(graph, topics) -> None:
     cycle = topics.next('cycle')
     assert list(cycle.missing) == [4]
     missing = page.inner_text('#missing')
-    assert missing.startswith('Pose 5 (') and ': ' in missing and not missing.endswith('missing')
+    assert missing.startswith('Pose 4 (') and ': ' in missing and not missing.endswith('missing')
     assert page.locator('#poses button.missing').count() == 1
     assert page.locator('#poses button.done').count() == len(cycle.points)
     assert '×' in page.inner_text('#picture-factor')

@@ -13,8 +13,6 @@ import argparse
 import sys
 from pathlib import Path
 
-import numpy as np
-
 from rtest_estimation.errors import UserError
 
 HELP = 'judge gauges, nest, sphere, repeatability and noise by a recorded check session'
@@ -32,6 +30,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Judge and print; returns the exit status."""
+    import numpy as np
+
     from rtest_estimation.bagfile import read_bag
     from rtest_estimation.recording import TYPES, recording_of, temperatures
     from rtest_estimation.standing import longest_standing

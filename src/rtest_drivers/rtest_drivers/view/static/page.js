@@ -393,7 +393,7 @@ function drawPoses() {
   const reasons = Object.entries(one.reasons).filter(([index]) => one.states[index] === 'missing');
   const list = rows(byId('missing'), reasons.length, () => element('li'));
   reasons.forEach(([index, text], place) => {
-    set(list[place], `Pose ${Number(index) + 1} (${one.names[index]}): ${text}`);
+    set(list[place], `Pose ${index} (${one.names[index]}): ${text}`);
   });
   if (shownPose !== null && one.names[shownPose]) showPose(one, shownPose);
   else set(byId('pose-name'), 'Tap a pose for its position.');
@@ -448,7 +448,7 @@ function drawGrid(grid, one, name) {
 function showPose(one, index) {
   const state = {open: 'to come', done: 'measured', missing: 'missing'}[one.states[index]];
   const why = one.reasons[index] ? `: ${one.reasons[index]}` : '';
-  set(byId('pose-name'), `Pose ${Number(index) + 1}, ${one.names[index]}: ${state}${why}`);
+  set(byId('pose-name'), `Pose ${index}, ${one.names[index]}: ${state}${why}`);
 }
 
 // ---- results ----
