@@ -2,10 +2,12 @@
 
 import asyncio
 import json
+import socket
 
 import pytest
 from aiohttp.test_utils import TestClient, TestServer
 
+from rtest_drivers.cli import main
 from rtest_drivers.view.devices import Report
 from rtest_drivers.view.server import KEY_HEADER, Server, address, is_local
 from rtest_drivers.view.state import CellState
@@ -152,3 +154,17 @@ def test_events_are_history_then_parts_that_changed_and_what_is() -> None:
     assert events[1] == ('part', {'name': 'location', 'shown': {'rows': []}})
     assert [name for name, _ in events].count('part') == 2
     assert [data['name'] for name, data in events if name == 'part'] == ['location', 'marks']
+
+
+@pytest.mark.parametrize('command', [['view'], ['session', '--view']])
+def test_an_address_that_cannot_be_served_is_one_line_before_anything_starts(
+    command, capsys, tmp_path, monkeypatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv('ROS_DOMAIN_ID', '0')
+    with socket.create_server(('127.0.0.1', 0)) as taken:
+        for port in (taken.getsockname()[1], 70000):
+            assert main([*command, '--port', str(port)]) == 2
+            said = capsys.readouterr().err
+            assert said.startswith('rtest: ') and str(port) in said and said.count('\n') == 1
+    assert not list(tmp_path.iterdir())

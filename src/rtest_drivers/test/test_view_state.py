@@ -249,6 +249,16 @@ def test_another_session_begins_anew() -> None:
     assert state.parts['cycle:0'][1]['cycle'] == '1b'
 
 
+def test_nodes_of_the_session_before_are_forgotten() -> None:
+    state = state_with_machine()
+    state.add_plan(plan())
+    state.add_report(Report('cell: simulation', 0, '', {}, 0.0))
+    state.add_report(Report('estimator: cycle', 0, '', {}, 60.0))
+    state.add_plan(plan(session='tuesday'))
+    names = [one['name'] for one in state.tick(60.5)['devices']]
+    assert 'cell' not in names and 'estimator' in names
+
+
 # ---- results ----
 
 

@@ -16,9 +16,17 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from rtest_drivers.commands.view import check_address
 from rtest_drivers.config import config_path
 from rtest_drivers.domain import held_domain
-from rtest_drivers.graph import RATE, VIEW_HOST, VIEW_PORT, GraphSettings, session_name
+from rtest_drivers.graph import (
+    RATE,
+    VIEW_HOST,
+    VIEW_PORT,
+    GraphSettings,
+    session_name,
+    view_node,
+)
 from rtest_drivers.runner import NodeFailed, Stopped, run_session
 from rtest_estimation.errors import UserError
 
@@ -87,6 +95,9 @@ def run(arguments: argparse.Namespace) -> int:
         hold=arguments.hold,
         view=(arguments.host, arguments.port) if arguments.view else None,
     )
+    if settings.view is not None:
+        view_node(*settings.view)
+        check_address(*settings.view)
     settings, complete = measure(settings, arguments.domain, bool(arguments.session))
     evaluate(settings, complete)
     return 0

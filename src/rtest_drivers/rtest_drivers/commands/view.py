@@ -9,9 +9,11 @@ from __future__ import annotations
 
 import argparse
 import os
+import socket
 
 from rtest_drivers.domain import chosen_domain
 from rtest_drivers.graph import VIEW_HOST, VIEW_PORT, ros_arguments, view_node
+from rtest_estimation.errors import UserError
 
 HELP = 'show a running cell on a page in the browser'
 
@@ -35,5 +37,21 @@ def run(arguments: argparse.Namespace) -> int:
     from rtest_drivers.nodes.view import main
 
     node = view_node(arguments.host, arguments.port)
+    check_address(arguments.host, arguments.port)
     os.environ['ROS_DOMAIN_ID'] = str(chosen_domain(False, arguments.domain))
     return main(['--ros-args', *ros_arguments(node, arguments.namespace, arguments.remap)])
+
+
+def check_address(host: str, port: int) -> None:
+    """Refuse an address that a page cannot be served at, before anything is started.
+
+    Raises UserError.
+    """
+    try:
+        family = socket.AF_INET6 if ':' in host else socket.AF_INET
+        socket.create_server((host, port), family=family).close()
+    except OSError as error:
+        raise UserError(
+            f'{host}:{port}: no page can be served there: {error.strerror}; choose another '
+            '--port or --host'
+        ) from None

@@ -141,7 +141,8 @@ class ViewNode(Node):
         for message in batch:
             for one in message.status:
                 values = {pair.key: pair.value for pair in one.values}
-                level = int.from_bytes(one.level, 'little')
+                # Others in the domain may send what the message does not define.
+                level = min(int.from_bytes(one.level, 'little'), 3)
                 self.state.add_report(Report(one.name, level, one.message, values, now))
 
     def _on_location(self, m: LocationErrors) -> None:

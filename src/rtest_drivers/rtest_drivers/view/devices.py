@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -16,16 +15,15 @@ _INTERVALS, _SHORTEST_S = 5.0, 1.0
 # The drivers say how they are twice a second, the other nodes once a second [s].
 _DRIVER_SILENT_S, _NODE_SILENT_S = 1.5, 3.0
 # A node that computes says nothing meanwhile: so long it may be busy [s].
-_BUSY_S = {'identifier': 120.0}
+_BUSY_S = {'identifier': 120.0, 'thermal': 120.0}
 _LONGEST_BUSY_S = 10.0
 # The rate is that of the last so many seconds.
 _RATE_S = 2.0
-_DRIVER = re.compile(r'(.+): driver')
 
 
 @dataclass(frozen=True)
 class Report:
-    """One status of /diagnostics. level : as in diagnostic_msgs; heard : wall time [s]."""
+    """One status of /diagnostics. level : 0 to 3 as in diagnostic_msgs; heard : wall time [s]."""
 
     name: str
     level: int
@@ -37,11 +35,6 @@ class Report:
     def source(self) -> str:
         """The node that says it: 'gauges: driver' and '/cell_1/gauges' are both of gauges."""
         return self.name.partition(':')[0].rpartition('/')[2].strip()
-
-    @property
-    def driver(self) -> bool:
-        """Whether it is the state of a driver."""
-        return _DRIVER.fullmatch(self.name) is not None
 
 
 class Stream:

@@ -42,6 +42,8 @@ _SESSION, _PROGRESS, _FINISHED = (
     'session: progress', 'estimator: cycle', 'estimator: finished cycle'
 )
 _LEVELS = (OK, WARN, ERROR, ERROR)
+# When a session begins, who has spoken in this time belongs to it [s].
+_RECENT_S = 5.0
 
 
 class CellState:
@@ -103,6 +105,11 @@ class CellState:
             self._maps.clear()
             self._reasons.clear()
             self._marks.clear()
+            # Nodes of the session before that are not in this one are nobody's fault.
+            last = max((one.heard for one in self._reports.values()), default=0.0)
+            self._reports = {
+                name: one for name, one in self._reports.items() if last - one.heard < _RECENT_S
+            }
             for name in list(self.parts):
                 self._put(name, None)
         if any(one.key == (plan.cycle, plan.stamp) for one in self._maps):

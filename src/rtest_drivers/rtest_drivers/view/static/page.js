@@ -14,7 +14,7 @@ const LOST_MS = 1500;
 let live = null, heard = 0, drawn = true;
 let strip = [];
 const parts = {};
-let shownCycle = null, shownPose = null, stripOf = 'gauges', plane = '3-D', shownLevel = '';
+let shownCycle = null, shownPose = null, stripOf = 'gauges', stripSpan = HISTORY_S, plane = '3-D', shownLevel = '';
 let turn = {azimuth: -0.6, height: 0.45};
 
 function element(tag, className, text) {
@@ -81,6 +81,8 @@ function draw() {
   set(byId('session'), session.name || 'R-test cell');
   const place = session.cycles ? `cycle ${session.cycle} of ${session.cycles}: ` : '';
   set(byId('doing'), place + session.text);
+  // What the session waits for stands out.
+  document.querySelector('[data-wish=start]').classList.toggle('chosen', Boolean(session.waits));
   drawDevices();
   drawGauges();
   drawAxes();
@@ -301,23 +303,25 @@ function drawStrip() {
   const names = gauges ? live.gauges.map((one) => one.name) : ['X', 'Y', 'Z'];
   const span = (row, index) => gauges ? row.spans[index] :
     row.sphere && [row.sphere[index], row.sphere[index]];
+  const recent = strip.filter((row) => row.t > live.t - stripSpan);
   const all = [];
-  for (const row of strip) {
+  for (const row of recent) {
     names.forEach((_, index) => { const one = span(row, index); if (one) all.push(...one); });
   }
   const ends = limits(all);
   legend('strip-legend', names);
   if (!ends) {
     context.fillStyle = '#56616c';
-    context.fillText('no valid values in the last 60 seconds', 20, 90);
+    context.fillText(`no valid values in the last ${stripSpan} seconds`, 20, 90);
     return;
   }
   const box = {left: 62, right: wide - 34, top: 22, bottom: 166};
   const at = frame(context, box, ends[0], ends[1], 'µm, full scale follows the values');
-  const x = (t) => box.right - (live.t - t) / HISTORY_S * (box.right - box.left);
+  const x = (t) => box.right - (live.t - t) / stripSpan * (box.right - box.left);
   context.textAlign = 'center';
   context.textBaseline = 'top';
-  for (const ago of [60, 45, 30, 15, 0]) {
+  for (const part of [1, 0.75, 0.5, 0.25, 0]) {
+    const ago = part * stripSpan;
     const place = x(live.t - ago);
     context.textAlign = ago === 0 ? 'right' : 'center';
     context.fillText(ago ? `−${ago} s` : 'now', place, box.bottom + 5);
@@ -327,7 +331,7 @@ function drawStrip() {
     context.lineWidth = 1.8;
     context.beginPath();
     let before = null;
-    for (const row of strip) {
+    for (const row of recent) {
       const one = span(row, index);
       // A gap stays a gap: nothing is drawn across it.
       if (!one) continue;
@@ -339,7 +343,7 @@ function drawStrip() {
     context.stroke();
   });
   nameLines(context, box, names.map((name, index) => {
-    const one = strip.slice(-5).map((row) => span(row, index)).filter((s) => s).pop();
+    const one = recent.slice(-5).map((row) => span(row, index)).filter((s) => s).pop();
     return one && {name: name.replace('gauge ', ''), y: at(one[1]), colour: COLOURS[index]};
   }).filter((one) => one));
 }
@@ -761,6 +765,7 @@ function start() {
     }
   };
   choose('strip-choice', (show) => { stripOf = show; });
+  choose('span-choice', (show) => { stripSpan = Number(show); });
   choose('picture-choice', (show) => { plane = show; drawPicture(); });
   let from = null;
   const picture = byId('picture');
