@@ -122,10 +122,15 @@ class Looker:
 
     def _name(self, topic: str) -> str:
         """A topic's full name; it may be given without the leading slash."""
-        names = [one.name for one in self.topics() if one.publishers]
-        for name in (topic, f'/{topic}'):
-            if name in names:
-                return name
+        end = time.monotonic() + _LONGEST_S
+        while True:
+            names = [one.name for one in self.topics() if one.publishers]
+            for name in (topic, f'/{topic}'):
+                if name in names:
+                    return name
+            if time.monotonic() > end:
+                break
+            self._spin(0.1)
         raise UserError(f'{topic}: nobody publishes that; there are {", ".join(names) or "none"}')
 
     def _subscribe(self, name: str, take: Any, raw: bool) -> None:

@@ -106,7 +106,7 @@ class Server:
             given = request.headers.get(KEY_HEADER, '')
             if not secrets.compare_digest(given.encode(), self.key.encode()):
                 return _refusal(
-                    403, 'controls are off: open the page with the address that rtest view printed'
+                    403, 'controls are off: load the page anew, with the address that was printed'
                 )
         response = await handler(request)
         if not response.prepared:
