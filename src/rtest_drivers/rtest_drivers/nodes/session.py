@@ -84,6 +84,14 @@ ENDED_S = 5.0
 HEARD_S = 1.0
 REPEAT, SKIP = 'repeat', 'skip'
 START, CALIBRATE, ABORT = 'start', 'calibrate', 'abort'
+# What then happens to the cycle.
+GRANTED = {
+    START: 'starts',
+    REPEAT: 'is measured anew',
+    SKIP: 'is left',
+    CALIBRATE: 'is measured anew after a calibration of the nest',
+    ABORT: 'ends, and the session with it',
+}
 # What the CNC driver says where no NC program runs.
 IDLE = 'IDLE'
 
@@ -127,7 +135,7 @@ class SessionNode(Node):
         }
         self._state = {name: self.create_client(GetState, f'{name}/get_state') for name in DRIVERS}
         self._finish = {name: self.create_client(Trigger, f'{name}/finish') for name in FINISHERS}
-        for wish in (START, REPEAT, SKIP, CALIBRATE, ABORT):
+        for wish in GRANTED:
             self.create_service(Trigger, f'~/{wish}', partial(self._on_wish, wish))
 
         self._spinner = SingleThreadedExecutor()
@@ -573,13 +581,12 @@ class SessionNode(Node):
         self, wish: str, _: Trigger.Request, response: Trigger.Response
     ) -> Trigger.Response:
         refused = self._refuses(wish)
-        response.success, response.message = not refused, self._status
+        response.success = not refused
         if refused:
-            response.message += f'; {refused}'
-        elif wish == START:
-            self._wish, response.message = wish, f'starting {self._held}'
+            response.message = f'{self._status}; {refused}'
         else:
-            self._wish = wish
+            cycle = self.config.plans[self._cycle_number - 1].cycle
+            self._wish, response.message = wish, f'{cycle} {GRANTED[wish]}'
         return response
 
     def _refuses(self, wish: str) -> str:
