@@ -1,8 +1,8 @@
 """Time of laser sphere centres in blocks beside SciPy reading by reading, in one run.
 
-    python bench/laser.py
+    python bench/laser.py [BAG]
 
-A recording as the simulated nest of three LK-G10 gives it: 1,183 positions, 20 readings at each.
+The readings of a recording (bags/laser) during which the sphere is in the calibrated volume.
 Eq. 5-4 for every reading by `scipy.optimize.least_squares`, with its own derivative by differences
 and with the analytic one and the faster Levenberg-Marquardt, against whole blocks.
 """
@@ -12,16 +12,18 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 from scipy.optimize import least_squares
 
-from rtest_drivers.sim.laser import SENSORS, Mounting, mount
-from rtest_estimation.laser import CentreSolver, calibrate
-from rtest_estimation.laser.verification import cube, verification_positions
+from rtest_estimation.laser import CentreSolver, CentreStatus
+from rtest_estimation.recording import read_recording
+from rtest_estimation.records import NestCalibration, Status
+from rtest_identification.offline import estimate_recording
 
-_RADIUS, _EDGE = 25e-3, 1e-3
-_READINGS, _SLOW, _REPEATS = 20, 1000, 5
+_BAG = Path(__file__).resolve().parents[1] / 'bags' / 'laser'
+_SLOW, _REPEATS = 1000, 5
 # What the blocks must reach: ratio, and agreement [m].
 _RATIO, _AGREEMENT = 100.0, 1e-9
 
@@ -35,18 +37,23 @@ def _median(function: Callable[[], object], repeats: int = _REPEATS) -> float:
     return float(np.median(times))
 
 
+def recorded(bag: Path) -> tuple[NestCalibration, np.ndarray]:
+    """The first nest of a recording, and the readings (n, lasers) of its set-up [m]."""
+    recording = read_recording(bag)
+    nest = next(f.nest for f in estimate_recording(recording) if f.nest is not None)
+    other = [plan.stamp for plan in recording.plans if plan.setup != nest.setup]
+    blocks = [b for b in recording.gauges if b.stamp < min(other, default=np.inf)]
+    status = np.concatenate([block.status for block in blocks])
+    readings = np.concatenate([block.displacement for block in blocks])
+    readings = readings[(status == Status.VALID).all(axis=1)]
+    _, place = CentreSolver(nest)(readings)
+    return nest, readings[place == CentreStatus.VALID]
+
+
 def main() -> int:
     """Print the table; 1 where the ratio or the agreement is not reached."""
-    rng = np.random.default_rng(1)
-    mounting = Mounting(
-        np.arange(3) * 2.0 * np.pi / 3.0, np.full(3, np.pi / 4.0), np.radians(1.0), 5e-5, 5e-5
-    )
-    laser = mount(SENSORS['LK-G10'], mounting, np.zeros(3), _RADIUS, rng)
-    known = np.vstack([np.zeros(3), cube(_EDGE, (3, 3, 3))])
-    means = np.mean([laser.read(known, rng)[0] for _ in range(_READINGS)], axis=0)
-    nest = calibrate(known, means, 'bench', '1a', 0, _RADIUS)
-    positions = np.repeat(verification_positions(_EDGE), _READINGS, axis=0)
-    readings, _ = laser.read(positions, rng)
+    nest, readings = recorded(Path(sys.argv[1]) if len(sys.argv) > 1 else _BAG)
+    radius = nest.sphere_radius
     solver = CentreSolver(nest)
     few = readings[:: len(readings) // _SLOW][:_SLOW]
 
@@ -56,7 +63,7 @@ def main() -> int:
             spots = nest.spot + reading[:, None] * nest.direction
 
             def misfit(x: np.ndarray, spots: np.ndarray = spots) -> np.ndarray:
-                return np.linalg.norm(spots - x, axis=1) - _RADIUS
+                return np.linalg.norm(spots - x, axis=1) - radius
 
             def slope(x: np.ndarray, spots: np.ndarray = spots) -> np.ndarray:
                 ray = x - spots

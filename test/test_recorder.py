@@ -28,6 +28,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
+from rtest_estimation.bagfile import read_bag
 from rtest_estimation.nodes.qos import LATCHED, LATCHED_100, STREAM
 from rtest_estimation.recording import read_recording
 
@@ -58,10 +59,12 @@ class Graph:
         while self.open:
             self.executor.spin_once(timeout_sec=0.05)
 
-    def start(self, *arguments, session='s1', **options):
+    def start(
+        self, *arguments, session='s1', program=('-m', 'rtest_drivers.nodes.recorder'), **options
+    ):
         process = subprocess.Popen(
             [
-                *(sys.executable, '-m', 'rtest_drivers.nodes.recorder', '--ros-args'),
+                *(sys.executable, *map(str, program), '--ros-args'),
                 *('-p', f'out:={self.out}', '-p', f'session:={session}', *arguments),
             ],
             env={
@@ -350,6 +353,92 @@ def test_full_disk_is_told_and_the_node_lives(graph):
     status, _, errors = told(process)
     assert status == 1
     assert 'cannot write' in errors
+
+
+# A recorder whose disk stops to answer when the first file appears in the folder, and goes on
+# answering when the second does.
+STALLING = """
+import os, sys, time
+from pathlib import Path
+from rtest_drivers import mcap_file
+stall, mend = map(Path, sys.argv[1:3])
+real = os.fsync
+def fsync(handle):
+    while stall.exists() and not mend.exists():
+        time.sleep(0.01)
+    real(handle)
+mcap_file.os.fsync = fsync
+from rtest_drivers.nodes.recorder import main
+sys.exit(main(sys.argv[:1] + sys.argv[3:]))
+"""
+
+
+def test_a_stalled_disk_is_told_counted_and_bounded(graph):
+    stall, mend = graph.out / 'stall', graph.out / 'mend'
+    heard = []
+    graph.node.create_subscription(DiagnosticArray, '/diagnostics', heard.append, STREAM)
+    process = graph.start('-p', 'memory_mb:=4', program=('-c', STALLING, stall, mend))
+    noise = graph.publisher(String, 'rtest/noise')
+    noise.publish(String(data='before'))
+    wait_for(lambda: states(heard))
+    stall.touch()
+    sent = 0
+    while not any(b'not written: ' in entry for entry in states(heard)):
+        noise.publish(String(data='x' * 50_000))
+        sent += 1
+        time.sleep(0.01)
+        assert sent < 3000
+    # What was told while the disk stood still.
+    (told_last,) = heard[-1:]
+    values = {pair.key: pair.value for pair in told_last.status[0].values}
+    assert int(values['waiting_bytes']) <= 4e6
+    wait_for(lambda: any(b'the disk has not answered for' in entry for entry in states(heard)))
+    mend.touch()
+    wait_for(lambda: any(b'was too slow or full' in entry for entry in states(heard)))
+    answer = graph.finish()
+    assert not answer.success
+    lost = int(re.search(r'; not written: (\d+) of /rtest/noise', answer.message)[1])
+    assert told(process)[0] == 0
+    bag = read_bag(graph.path(), ())
+    assert bag.closed
+    assert bag.topics['/rtest/noise'][1] + lost == sent + 1
+    counted = f'not written /rtest/noise: {lost} messages'
+    assert any(counted in warning for warning in bag.warnings)
+
+
+def test_a_clock_that_is_set_does_not_part_the_messages(graph):
+    program = """
+import sys, time
+from types import SimpleNamespace
+from rtest_drivers import clock
+from rtest_drivers.nodes import recorder
+begun = time.monotonic()
+# A day back after two seconds.
+clock.time = SimpleNamespace(
+    monotonic_ns=time.monotonic_ns,
+    time_ns=lambda: time.time_ns() - (86400 * 10**9 if time.monotonic() - begun > 2 else 0),
+)
+sys.exit(recorder.main())
+"""
+    heard = []
+    graph.node.create_subscription(DiagnosticArray, '/diagnostics', heard.append, STREAM)
+    before = time.time_ns()
+    process = graph.start(program=('-c', program))
+    readings = graph.publisher(GaugeSamples, 'rtest/gauges')
+    sent = 0
+    while not any(b'clock was set by -8.64e+04 s' in entry for entry in states(heard)):
+        readings.publish(gauges(READINGS * sent))
+        sent += 1
+        time.sleep(0.01)
+        assert sent < 3000
+    assert graph.finish().success
+    assert told(process)[0] == 0
+    with graph.path().open('rb') as file:
+        messages = make_reader(file).iter_messages(topics='/rtest/gauges', log_time_order=False)
+        times = [message.log_time for _, _, message in messages]
+    assert len(times) == sent
+    assert times == sorted(times)
+    assert before < times[0] and times[-1] < time.time_ns()
 
 
 @pytest.mark.parametrize(

@@ -21,6 +21,7 @@ setup(
     entry_points={
         'console_scripts': [
             'identifier = rtest_identification.nodes.identifier:main',
+            'thermal = rtest_identification.nodes.thermal:main',
         ],
     },
 )

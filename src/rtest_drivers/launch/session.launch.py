@@ -1,6 +1,5 @@
 """The graph of a session under `ros2 launch`; `rtest session` starts the same nodes without it."""
 
-from dataclasses import replace
 from pathlib import Path
 
 from launch.actions import DeclareLaunchArgument, OpaqueFunction, SetEnvironmentVariable, Shutdown
@@ -48,9 +47,7 @@ def graph(context: LaunchContext) -> list[Node]:
         view=(VIEW_HOST, VIEW_PORT) if chosen['view'] == 'true' else None,
     )
     session = load_session(config)
-    settings = replace(
-        settings, sphere_radius=session.sphere_radius, devices=session.devices
-    )
+    settings = settings.of(session)
     return [
         (LifecycleNode if node.lifecycle else Node)(
             package=node.package,

@@ -1,4 +1,4 @@
-"""Where readings and feedback come from: the backends of the gauge and the CNC driver.
+"""Where the data come from: the backends of the gauge, the CNC and the thermometer driver.
 
 A backend stamps at the read, in the clock of its device. It counts what the device has acquired in
 `GaugeBlock.sequence`, so that a jump is a loss; the driver makes that start at zero.
@@ -9,17 +9,25 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, Protocol, TypeVar
 
-from rtest_drivers.cell_link import CNC, GAUGES, CellCnc, CellGauges
+from rtest_drivers.cell_link import (
+    CNC,
+    GAUGES,
+    THERMOMETERS,
+    CellCnc,
+    CellGauges,
+    CellThermometers,
+)
 from rtest_drivers.cnc.linuxcnc import LinuxCnc
 from rtest_drivers.cnc.mtconnect import MtConnect
 from rtest_drivers.cnc.opcua import OpcUa
 from rtest_drivers.gauges.nest import SerialNest
+from rtest_drivers.thermometers.serial_thermometers import SerialThermometers
 from rtest_estimation.errors import UserError
-from rtest_estimation.records import Feedback, GaugeBlock
+from rtest_estimation.records import Feedback, GaugeBlock, Temperature
 
 __all__ = [
-    'CELL', 'CNC', 'CNC_BACKENDS', 'GAUGES', 'GAUGE_BACKENDS', 'CncBackend', 'GaugeBackend',
-    'make',
+    'CELL', 'CNC', 'CNC_BACKENDS', 'GAUGES', 'GAUGE_BACKENDS', 'THERMOMETERS',
+    'THERMOMETER_BACKENDS', 'CncBackend', 'GaugeBackend', 'ThermometerBackend', 'make',
 ]
 
 
@@ -71,6 +79,25 @@ class CncBackend(Protocol):
         """
 
 
+class ThermometerBackend(Protocol):
+    """Thermometers."""
+
+    def open(self) -> None:
+        """Connect; raises ConnectionError saying what failed and what to do."""
+
+    def read(self, timeout: float) -> list[Temperature]:
+        """What came since the last call, waiting up to `timeout` [s] for the first.
+
+        Empty where nothing came in that time. Raises ConnectionError when all are lost.
+        """
+
+    def close(self) -> None:
+        """Disconnect; does nothing where it is not open."""
+
+    def health(self) -> tuple[str, dict[str, Any]]:
+        """What is wrong since the last call while readings go on, '' for nothing; figures."""
+
+
 CELL = 'cell'
 # Name of the parameter `backend` to what makes one from the parameter `address`: the socket of the
 # simulated cell, or the path of a device file.
@@ -79,6 +106,9 @@ GAUGE_BACKENDS: dict[str, Callable[[str], GaugeBackend]] = {
 }
 CNC_BACKENDS: dict[str, Callable[[str], CncBackend]] = {
     CELL: CellCnc, 'linuxcnc': LinuxCnc, 'mtconnect': MtConnect, 'opcua': OpcUa,
+}
+THERMOMETER_BACKENDS: dict[str, Callable[[str], ThermometerBackend]] = {
+    CELL: CellThermometers, 'serial': SerialThermometers,
 }
 
 _Backend = TypeVar('_Backend')

@@ -1,4 +1,4 @@
-"""The wire between the simulated cell and its two drivers: an AF_UNIX socket, two channels.
+"""The wire between the simulated cell and its drivers: an AF_UNIX socket, a channel for each.
 
 The client asks, the server answers with everything it has by then, perhaps after a short wait, and
 perhaps with nothing. The next question says that the answer was dealt with, so that the cell knows
@@ -21,16 +21,18 @@ from multiprocessing.connection import Client, Connection, Listener
 import numpy as np
 
 from rtest_estimation.errors import UserError
-from rtest_estimation.records import Feedback, GaugeBlock
+from rtest_estimation.records import Feedback, GaugeBlock, Temperature
 
-GAUGES, CNC = 'gauges', 'cnc'
-CHANNELS = (GAUGES, CNC)
+GAUGES, CNC, THERMOMETERS = 'gauges', 'cnc', 'thermometers'
+CHANNELS = (GAUGES, CNC, THERMOMETERS)
+Record = GaugeBlock | Feedback | Temperature
 DEFAULT_ADDRESS = os.path.join(tempfile.gettempdir(), 'rtest_cell.sock')
 _ASK = b'?'
 # Longest wait of the server for something to answer with; the client's time-out is longer.
 _WAIT_S = 0.1
 _BLOCK = struct.Struct('<cqQdIH')
 _FEEDBACK = struct.Struct('<cqHH')
+_TEMPERATURE = struct.Struct('<cqddH')
 # sun_path holds 108 bytes on Linux, with a zero at the end.
 _LONGEST_PATH = 107
 
@@ -39,7 +41,7 @@ class LinkError(ConnectionError):
     """The link is down or speaks another language; says what to do."""
 
 
-def encode(records: Sequence[GaugeBlock | Feedback]) -> bytes:
+def encode(records: Sequence[Record]) -> bytes:
     """Records to one answer."""
     parts = []
     for record in records:
@@ -52,6 +54,12 @@ def encode(records: Sequence[GaugeBlock | Feedback]) -> bytes:
                 np.ascontiguousarray(record.displacement, dtype='<f8').tobytes(),
                 np.ascontiguousarray(record.status, dtype=np.uint8).tobytes(),
             ]
+        elif isinstance(record, Temperature):
+            name = record.sensor.encode()
+            parts += [
+                _TEMPERATURE.pack(b'T', record.stamp, record.value, record.variance, len(name)),
+                name,
+            ]
         else:
             names = '\0'.join(record.axes).encode()
             parts += [
@@ -62,9 +70,9 @@ def encode(records: Sequence[GaugeBlock | Feedback]) -> bytes:
     return b''.join(parts)
 
 
-def decode(data: bytes) -> list[GaugeBlock | Feedback]:
+def decode(data: bytes) -> list[Record]:
     """One answer to records; raises LinkError where it is damaged."""
-    records: list[GaugeBlock | Feedback] = []
+    records: list[Record] = []
     at = 0
     try:
         while at < len(data):
@@ -92,6 +100,14 @@ def decode(data: bytes) -> list[GaugeBlock | Feedback]:
                 if len(axes) != count:
                     raise ValueError(f'{count} positions, names {axes}')
                 records.append(Feedback(stamp, axes, position))
+            elif kind == b'T':
+                _, stamp, value, variance, length = _TEMPERATURE.unpack_from(data, at)
+                at += _TEMPERATURE.size
+                if at + length > len(data):
+                    raise ValueError('the name of a sensor is cut off')
+                name = data[at : at + length].decode()
+                at += length
+                records.append(Temperature(stamp, name, value, variance))
             else:
                 raise ValueError(f'record of kind {kind!r}')
     except (struct.error, ValueError) as error:
@@ -100,7 +116,7 @@ def decode(data: bytes) -> list[GaugeBlock | Feedback]:
 
 
 class CellServer:
-    """The cell's side: two outboxes; threads hand them to whoever connects.
+    """The cell's side: an outbox a channel; threads hand them to whoever connects.
 
     A channel nobody is connected to drops what it is sent: a device reads on when nobody looks.
     """
@@ -121,7 +137,7 @@ class CellServer:
         self._acceptor = threading.Thread(target=self._accept, name='cell link', daemon=True)
         self._acceptor.start()
 
-    def send(self, channel: str, records: Sequence[GaugeBlock | Feedback]) -> None:
+    def send(self, channel: str, records: Sequence[Record]) -> None:
         """Put records into a channel's outbox; they are dropped where nobody is connected."""
         self._outboxes[channel].put(records)
 
@@ -184,7 +200,7 @@ class _Outbox:
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
-        self._records: list[GaugeBlock | Feedback] = []
+        self._records: list[Record] = []
         self._handed = False
         self.client: Connection | None = None
 
@@ -199,13 +215,13 @@ class _Outbox:
             if self.client is client:
                 self.client, self._records, self._handed = None, [], False
 
-    def put(self, records: Sequence[GaugeBlock | Feedback]) -> None:
+    def put(self, records: Sequence[Record]) -> None:
         with self._changed:
             if self.client is not None and records:
                 self._records += records
                 self._changed.notify_all()
 
-    def take(self, client: Connection) -> list[GaugeBlock | Feedback] | None:
+    def take(self, client: Connection) -> list[Record] | None:
         """The driver asks: what it was given before is dealt with. None for one replaced."""
         with self._changed:
             if self.client is not client:
@@ -246,7 +262,7 @@ class CellClient:
                 'or set the parameter address of both alike'
             ) from None
 
-    def read(self, timeout: float) -> list[GaugeBlock | Feedback]:
+    def read(self, timeout: float) -> list[Record]:
         """Ask, and wait for the answer up to `timeout` [s]; raises LinkError when it is down.
 
         After a time-out the question still stands, and the next call waits for its answer.
@@ -313,6 +329,21 @@ class CellCnc(CellClient):
     def told(self) -> dict[str, str]:
         """The cell has nothing to tell of itself."""
         return {}
+
+
+class CellThermometers(CellClient):
+    """The simulated cell's thermometers: backend 'cell' of the thermometer driver."""
+
+    def __init__(self, address: str) -> None:
+        super().__init__(address, THERMOMETERS)
+
+    def read(self, timeout: float) -> list[Temperature]:
+        """Temperatures since the last call; raises LinkError when the cell is gone."""
+        return [record for record in super().read(timeout) if isinstance(record, Temperature)]
+
+    def health(self) -> tuple[str, dict[str, str]]:
+        """The cell has nothing to tell of itself."""
+        return '', {}
 
 
 def _clear(address: str) -> None:

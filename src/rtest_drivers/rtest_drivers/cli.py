@@ -14,11 +14,14 @@ from rtest_drivers.commands import (
     check,
     correct,
     demo,
+    dynamic,
     frustum,
     gap,
     identify,
     info,
+    laser,
     plan,
+    replay,
     session,
     thermal,
     topics,
@@ -29,7 +32,8 @@ from rtest_drivers.runner import NodeFailed, Stopped
 from rtest_estimation.errors import UserError
 
 COMMANDS = (
-    session, check, view, ask, topics, demo, plan, identify, gap, thermal, frustum, correct, info,
+    session, check, view, ask, topics, demo, plan, identify, gap, thermal, dynamic, frustum,
+    correct, laser, replay, info,
 )
 EXIT_FAILED, EXIT_USER, EXIT_INTERRUPTED, EXIT_PIPE = 1, 2, 130, 141
 

@@ -10,8 +10,9 @@ from rtest_drivers.cnc.linuxcnc import LinuxCnc, load_linuxcnc
 from rtest_drivers.cnc.linuxcnc_control import Control, make_moves
 from rtest_drivers.cnc.sense import Move, judge
 from rtest_drivers.devices import BACKENDS
-from rtest_drivers.gauges.check import ChannelCheck, ControllerCheck, check_nest
+from rtest_drivers.gauges.check import ChannelCheck, ControllerCheck, check_controllers
 from rtest_drivers.gauges.config import load_nest
+from rtest_drivers.thermometers.config import load_thermometers
 from rtest_estimation.dwell import ROTARY_LETTERS
 from rtest_estimation.errors import UserError
 from rtest_estimation.records import Status
@@ -20,6 +21,8 @@ from rtest_identification.session_file import Device, SessionConfig
 SECONDS = 2.0
 # A device that gives less than this part of the readings asked for is too slow for its settings.
 _FEWEST = 0.8
+# Thermometers are slow: asked so often at least.
+_FEWEST_ANSWERS = 3.5
 # How far each axis is moved for the check of its sense [m], [rad].
 _MOVE = (1e-3, math.radians(1.0))
 
@@ -35,7 +38,8 @@ def check_session_devices(
     """
     wrong = []
     for name, device in config.devices.items():
-        lines, problems = (_gauges if name == 'gauges' else _cnc)(device)
+        try_ = {'gauges': _gauges, 'cnc': _cnc, 'thermometers': _thermometers}[name]
+        lines, problems = try_(device)
         if name == 'cnc' and moves and not problems:
             more, problems = _moves(device)
             lines += more
@@ -46,7 +50,7 @@ def check_session_devices(
 
 
 def _gauges(device: Device) -> tuple[list[str], list[str]]:
-    found = check_nest(load_nest(device.file), SECONDS)
+    found = check_controllers(load_nest(device.file).controllers, SECONDS)
     lines = [
         f'gauges: {device.file}',
         f'  {"port, protocol":36} {"answers":>7} {"rate [1/s]":>12} {"jitter":>8} {"longest":>8} '
@@ -64,21 +68,51 @@ def _gauges(device: Device) -> tuple[list[str], list[str]]:
             f'  {one.unit}, {limits}'
         )
         lines += [_channel(channel) for channel in one.channels]
-        problems += _controller_problems(one)
+        problems += _controller_problems('gauges', one)
+    return lines, problems
+
+
+def _thermometers(device: Device) -> tuple[list[str], list[str]]:
+    """Every line asked some times, and the temperature of each sensor."""
+    configs = load_thermometers(device.file)
+    seconds = max(SECONDS, *(_FEWEST_ANSWERS / config.rate for config in configs))
+    lines = [
+        f'thermometers: {device.file}',
+        f'  {"port":36} {"answers":>7} {"rate [1/s]":>12} {"stamp":>8}  unit, range',
+    ]
+    problems = []
+    for config, one in zip(configs, check_controllers(configs, seconds), strict=True):
+        lines.append(
+            f'  {one.port:36} {"no" if one.problem else "yes":>7} '
+            f'{f"{_number(one.rate, 2)} of {one.wanted_rate:g}":>12} '
+            f'{_ms(one.stamp_uncertainty):>8}  {one.unit}, {one.limits[0]:g} to '
+            f'{one.limits[1]:g} degC'
+        )
+        problems += _controller_problems('thermometers', one)
+        for sensor, channel in zip(config.sensors, one.channels, strict=True):
+            noise = '' if math.isnan(channel.noise) else f', noise {channel.noise:.3f} K'
+            value = '' if math.isnan(channel.last) else f', {channel.last:.2f} degC{noise}'
+            lines.append(f'    {sensor}: {_status(channel)}{value}')
+            if not one.problem and channel.status is not Status.VALID:
+                problems.append(f'thermometers: {one.port}: {sensor}: {_status(channel)}; check '
+                                'its wire and range_c')
     return lines, problems
 
 
 def _channel(one: ChannelCheck) -> str:
-    status = 'no reading' if one.status is None else one.status.name.lower().replace('_', ' ')
     value = '' if math.isnan(one.last) else f', {one.last * 1e3:+.4f} mm'
     noise = '' if math.isnan(one.noise) else f', noise {one.noise * 1e6:.2f} µm'
-    return f'    gauge {one.channel}: {status}{value}{noise}'
+    return f'    gauge {one.channel}: {_status(one)}{value}{noise}'
 
 
-def _controller_problems(one: ControllerCheck) -> Iterator[str]:
-    where = f'gauges: {one.port}'
+def _status(one: ChannelCheck) -> str:
+    return 'no reading' if one.status is None else one.status.name.lower().replace('_', ' ')
+
+
+def _controller_problems(device: str, one: ControllerCheck) -> Iterator[str]:
+    where = f'{device}: {one.port}'
     if one.problem:
-        yield f'gauges: {one.problem}'
+        yield f'{device}: {one.problem}'
     elif any(channel.status is Status.DEVICE_ERROR for channel in one.channels):
         yield f'{where}: {one.note}'
     elif not one.rate > _FEWEST * one.wanted_rate:

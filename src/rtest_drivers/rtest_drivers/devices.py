@@ -6,16 +6,19 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from rtest_drivers.backends import CELL, CNC_BACKENDS, GAUGE_BACKENDS, make
+from rtest_drivers.backends import CELL, CNC_BACKENDS, GAUGE_BACKENDS, THERMOMETER_BACKENDS, make
 from rtest_drivers.cnc.linuxcnc import load_linuxcnc
 from rtest_drivers.cnc.programs import program_of
 from rtest_estimation.errors import UserError
+from rtest_identification.plans import program_name
 from rtest_identification.session_file import BY_HAND, SessionConfig
 
 # What can be named in a session file: the simulated cell is given with --simulate.
 BACKENDS: dict[str, dict[str, Callable[[str], Any]]] = {
-    'gauges': {name: one for name, one in GAUGE_BACKENDS.items() if name != CELL},
-    'cnc': {name: one for name, one in CNC_BACKENDS.items() if name != CELL},
+    driver: {name: one for name, one in known.items() if name != CELL}
+    for driver, known in (
+        ('gauges', GAUGE_BACKENDS), ('cnc', CNC_BACKENDS), ('thermometers', THERMOMETER_BACKENDS),
+    )
 }
 
 
@@ -45,6 +48,7 @@ def check_devices(config: SessionConfig, path: Path) -> None:
         for plan in config.plans:
             if program_of(plan.cycle, path.parent) is None:
                 raise UserError(
-                    f'{where}: run_programs: no program {plan.cycle}.ngc beside the session file; '
+                    f'{where}: run_programs: no program {program_name(plan.cycle)}.ngc beside the '
+                    'session file; '
                     'write them with `rtest plan` and run the session file it wrote'
                 )

@@ -7,6 +7,7 @@ import os
 import socket
 from collections.abc import Iterator
 
+from rtest_drivers.config import config_path
 from rtest_estimation.errors import UserError
 
 LARGEST = 232
@@ -14,15 +15,24 @@ LARGEST = 232
 _PORT_BASE, _PORT_STEP, _DOMAINS = 7400, 250, 101
 # What would let a simulated session be seen from elsewhere.
 _ELSEWHERE = ('ROS_LOCALHOST_ONLY', 'ROS_STATIC_PEERS', 'ROS_DISCOVERY_SERVER')
+_RANGE, _PROFILES = 'ROS_AUTOMATIC_DISCOVERY_RANGE', 'FASTRTPS_DEFAULT_PROFILES_FILE'
 
 
 def session_environment(simulated: bool, domain: int) -> dict[str, str]:
-    """Environment of the nodes: a simulated cell stays on this host, whatever the user's says."""
+    """Environment of the nodes: on this host only, unless the user's says where else.
+
+    A simulated cell stays here whatever the user's environment says.
+    """
     environment = {**os.environ, 'ROS_DOMAIN_ID': str(domain), 'PYTHONUNBUFFERED': '1'}
     if simulated:
         for name in _ELSEWHERE:
             environment.pop(name, None)
-        environment['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
+        environment[_RANGE] = 'LOCALHOST'
+    elif not any(name in environment for name in (*_ELSEWHERE, _RANGE)):
+        environment[_RANGE] = 'LOCALHOST'
+    if environment.get(_RANGE) == 'LOCALHOST':
+        # The range alone is about who is looked for: the nodes would still listen everywhere.
+        environment.setdefault(_PROFILES, str(config_path('this_host.xml')))
     return environment
 
 

@@ -7,14 +7,15 @@ import re
 import tempfile
 import time
 import uuid
-from dataclasses import dataclass, field
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rtest_estimation.errors import UserError
 
 if TYPE_CHECKING:
-    from rtest_identification.session_file import Device
+    from rtest_identification.session_file import Device, SessionConfig
 
 ParameterValue = str | int | float | bool
 
@@ -62,10 +63,11 @@ class GraphSettings:
 
     config : session file (YAML)
     session : name of the session, of its folder and of its recording
-    sphere_radius : of the session file [m]
+    sphere_radius : of the session file [m]; nest : 'contact' or 'laser', as there
     out : the recording is written to out/session/session.mcap
     simulate : truth file of the simulated cell; None for real devices
     devices : of the session file, for the drivers that are to be started; not used with `simulate`
+    thermal : whether the session repeats a cycle while the machine warms up
     rate : simulated seconds per second of wall time
     namespace : of every node and topic, empty for none
     remaps : rules ``from:=to`` for every node
@@ -80,6 +82,8 @@ class GraphSettings:
     simulate: Path | None = None
     devices: dict[str, Device] = field(default_factory=dict)
     sphere_radius: float = 0.0127
+    nest: str = 'contact'
+    thermal: bool = False
     rate: float = 1.0
     namespace: str = ''
     remaps: tuple[str, ...] = ()
@@ -98,14 +102,19 @@ class GraphSettings:
             raise UserError(
                 f'namespace {self.namespace!r}: expected a ROS name such as cell_1 or /hall/cell_1'
             )
-        for rule in self.remaps:
-            if not _REMAP.fullmatch(rule):
-                raise UserError(f'remap {rule!r}: expected FROM:=TO')
+        check_remaps(self.remaps)
         if not 0.0 < self.rate < float('inf'):
             raise UserError(
                 f'rate {self.rate:g}: expected a number above 0; at {RATE:g} two processor cores '
                 'lose nothing'
             )
+
+    def of(self, session: SessionConfig) -> GraphSettings:
+        """With what the session file says."""
+        return replace(
+            self, sphere_radius=session.sphere_radius, nest=session.nest.name.lower(),
+            devices=session.devices, thermal=session.every > 0.0,
+        )
 
     @property
     def folder(self) -> Path:
@@ -121,6 +130,13 @@ class GraphSettings:
     def recording(self) -> Path:
         """The recording, one MCAP file."""
         return self.folder / f'{self.session}.mcap'
+
+
+def check_remaps(rules: Iterable[str]) -> None:
+    """Refuse what is no rule ``from:=to`` (UserError)."""
+    for rule in rules:
+        if not _REMAP.fullmatch(rule):
+            raise UserError(f'remap {rule!r}: expected FROM:=TO')
 
 
 def session_name(stem: str) -> str:
@@ -152,9 +168,11 @@ def session_nodes(settings: GraphSettings) -> tuple[GraphNode, ...]:
         GraphNode(
             'estimator',
             'rtest_estimation',
-            {'sphere_radius_mm': settings.sphere_radius * 1e3, **clock},
+            {
+                'sphere_radius_mm': settings.sphere_radius * 1e3, 'nest': settings.nest, **clock,
+            },
         ),
-        GraphNode('identifier', 'rtest_identification', clock),
+        _identifier(settings, clock),
     ]
     if simulated:
         nodes += [
@@ -171,6 +189,8 @@ def session_nodes(settings: GraphSettings) -> tuple[GraphNode, ...]:
             GraphNode('gauges', 'rtest_drivers', driver, lifecycle=True),
             GraphNode('cnc', 'rtest_drivers', driver, lifecycle=True),
         ]
+        if settings.thermal:
+            nodes.append(GraphNode('thermometers', 'rtest_drivers', driver, lifecycle=True))
     else:
         nodes += [
             GraphNode(
@@ -204,6 +224,15 @@ def view_node(host: str, port: int) -> GraphNode:
     if not 0 <= port <= 65535:
         raise UserError(f'--port {port}: expected a number from 0 to 65535')
     return GraphNode('view', 'rtest_drivers', {'host': host, 'port': port}, optional=True)
+
+
+def _identifier(settings: GraphSettings, clock: dict[str, ParameterValue]) -> GraphNode:
+    """Who makes errors of finished cycles."""
+    if settings.thermal:
+        return GraphNode(
+            'thermal', 'rtest_identification', {'out': str(settings.folder / 'thermal'), **clock}
+        )
+    return GraphNode('identifier', 'rtest_identification', clock)
 
 
 def ros_arguments(node: GraphNode, namespace: str = '', remaps: tuple[str, ...] = ()) -> list[str]:

@@ -2,37 +2,42 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from datetime import datetime, timezone
 from pathlib import Path
 
-import yaml
-
+from rtest_drivers.provenance import TOPIC
 from rtest_estimation.bagfile import Bag, read_bag
 from rtest_estimation.errors import UserError
 from rtest_estimation.missing import grouped
 from rtest_estimation.pipeline import Finished
+from rtest_estimation.plain_text import printable
 from rtest_estimation.recording import TYPES, Recording, recording_of
 from rtest_estimation.records import CyclePlan
+from rtest_estimation.yaml_text import load_yaml
 from rtest_identification.offline import estimate_recording
 
 
-def describe(path: str | Path) -> list[str]:
+def describe(path: str | Path, topics: Mapping[str, str] | None = None) -> list[str]:
     """Lines that describe a recording: topics, session, plans, losses, missing poses, warnings.
 
     Works for any bag; one that cannot be identified from is described with the reason.
+
+    topics : role to topic name, as in `rtest_estimation.recording.read_recording`
 
     Raises UserError where there is no recording at `path`.
     """
     bag = read_bag(path, TYPES)
     lines = _file_lines(bag)
     try:
-        recording = recording_of(bag)
+        recording = recording_of(bag, topics)
     except UserError as error:
         warnings: tuple[str, ...] = (*bag.warnings, f'not a complete session: {error}')
     else:
         finished = estimate_recording(recording)
         lines += _session_lines(recording) + _missing_lines(finished)
         warnings = (*recording.warnings, *_problems(finished))
+    lines += _software_lines(bag)
     return lines + _topic_lines(bag) + [f'warning   {warning}' for warning in warnings]
 
 
@@ -45,6 +50,19 @@ def _file_lines(bag: Bag) -> list[str]:
             f'duration  {(bag.end - bag.start) / 1e9:.1f} s',
         ]
     return [*lines, f'closed    {"yes" if bag.closed else "no"}']
+
+
+def _software_lines(bag: Bag) -> list[str]:
+    """By which code the session was measured, where the recording says it."""
+    for topic, (kind, _) in bag.topics.items():
+        if topic.endswith(f'/{TOPIC}') and kind == 'std_msgs/msg/String':
+            for message in bag.messages(topic):
+                try:
+                    found = load_yaml(message.data, topic)['software'].items()
+                    return [f'software  {package} {version}' for package, version in found]
+                except (UserError, AttributeError, KeyError, TypeError):
+                    return [f'software  {topic} cannot be read']
+    return []
 
 
 def _session_lines(recording: Recording) -> list[str]:
@@ -83,8 +101,8 @@ def _machine_name(text: str | None) -> str:
     if text is None:
         return 'not recorded'
     try:
-        return str(yaml.safe_load(text)['name'])
-    except (yaml.YAMLError, KeyError, TypeError):
+        return printable(str(load_yaml(text, 'machine')['name']))
+    except (UserError, KeyError, TypeError):
         return 'recorded, without a name'
 
 

@@ -6,41 +6,33 @@ followed by the end of an MCAP file without an index. The next chunk overwrites 
 recorder that is killed therefore leaves a complete file that every reader scans instead of
 seeking in; `McapFile.close` puts the index there. Only a cut through the one write of a chunk
 (power failure, disk full) leaves a file without an end, whole up to that chunk.
+
+What never came into the file is in it as a number: metadata records named `LOSSES`, the last of
+which counts.
 """
 
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
-from typing import Any
 
 import yaml
 from mcap.writer import CompressionType, IndexType, Writer
 
-# Messages wait in memory while the disk refuses them, up to this much.
-MAX_WAITING = 256 * 1024 * 1024
+from rtest_drivers.bag_metadata import RecordedTopic, bag_metadata, sync_folder, write_metadata
+from rtest_estimation.mcap_scan import LOSSES
+
 CHUNK_SIZE = 1024 * 1024
-METADATA_VERSION = 9
-ROS_DISTRO = 'jazzy'
-NO_START = 2**63 - 1
-
-
-class RecordingFullError(OSError):
-    """The disk refuses what is written and the memory to wait in is used up."""
 
 
 @dataclass
-class _Topic:
-    """One recorded topic, as metadata.yaml lists it."""
+class _Topic(RecordedTopic):
+    """One recorded topic and its channel in the file."""
 
-    name: str
-    type_name: str
-    type_hash: str
-    qos: str
-    channel: int
-    count: int = 0
+    channel: int = 0
 
 
 @dataclass
@@ -89,6 +81,7 @@ class McapFile:
         self._closed = False
         self._index_built = False
         self._unwritten = True
+        self._losses: dict[str, str] = {}
         self._waiting = _Waiting()
         self._provisional_end = _end_without_index()
         self._writer = Writer(
@@ -98,8 +91,8 @@ class McapFile:
         )
         self._writer.start(profile='ros2', library='rtest')
         self.flush()
-        _sync_folder(folder)
-        _sync_folder(folder.parent)
+        sync_folder(folder)
+        sync_folder(folder.parent)
 
     @property
     def counts(self) -> dict[str, int]:
@@ -132,7 +125,7 @@ class McapFile:
             self._schemas[type_name],
             {'offered_qos_profiles': offered_qos, 'topic_type_hash': type_hash},
         )
-        self._topics[name] = _Topic(name, type_name, type_hash, offered_qos, channel)
+        self._topics[name] = _Topic(name, type_name, type_hash, offered_qos, channel=channel)
         self._unwritten = True
 
     def write(
@@ -145,15 +138,10 @@ class McapFile:
         data : CDR with its encapsulation header
 
         Raises ValueError for a log time of 0 or before: a single one makes viewers lay out
-        fifty years. Raises RecordingFullError where the disk has refused messages for so long
-        that no more can wait; the message is not taken.
+        fifty years.
         """
         if log_time <= 0:
             raise ValueError(f'{topic}: log time {log_time} ns, expected the time of reception')
-        if self.waiting > MAX_WAITING:
-            raise RecordingFullError(
-                f'{self.path}: {self.waiting} bytes wait for the disk, no more fit into memory'
-            )
         entry = self._topics[topic]
         self._writer.add_message(
             entry.channel,
@@ -168,6 +156,17 @@ class McapFile:
         self.end = log_time if self.end is None else max(self.end, log_time)
         self._unwritten = True
 
+    def note_losses(self, losses: Mapping[str, int]) -> None:
+        """Say in the file what is not in it, each time with all that is known so far.
+
+        losses : what is missing and where, such as ``not written /rtest/gauges``, to its number
+        """
+        noted = {what: str(count) for what, count in losses.items()}
+        if noted != self._losses and not self._index_built:
+            self._losses = noted
+            self._writer.add_metadata(LOSSES, noted)
+            self._unwritten = True
+
     def flush(self) -> None:
         """Put everything received so far on the disk, as an MCAP file that opens.
 
@@ -177,7 +176,7 @@ class McapFile:
             return
         self._writer.flush()
         self._store()
-        self._write_metadata()
+        write_metadata(self.path.parent, self._metadata())
         self._unwritten = False
 
     def close(self) -> None:
@@ -197,74 +196,31 @@ class McapFile:
             # Built once only: a second attempt stores what the first could not.
             self._index_built = True
         self._store()
-        self._write_metadata()
+        write_metadata(self.path.parent, self._metadata())
         self._closed = True
         os.close(self._file)
 
     def _store(self) -> None:
         """Write what waits, and an end, over the previous end, through to the disk."""
-        data = self._waiting.data
+        waiting = self._waiting
         end = b'' if self._index_built else self._provisional_end
-        block = memoryview(bytes(data) + end)
-        place = self._waiting.base
+        place, size = waiting.base, len(waiting.data) + len(end)
         written = 0
-        while written < len(block):
-            written += os.pwrite(self._file, block[written:], place + written)
-        os.ftruncate(self._file, place + len(block))
+        # Not copied together: what waits may be as large as the memory allows.
+        with memoryview(waiting.data) as data:
+            while written < size:
+                end_left = end[max(0, written - len(data)) :]
+                # Released at once: nothing can be added to what is still looked at.
+                with data[written:] as data_left:
+                    written += os.pwritev(self._file, [data_left, end_left], place + written)
+        os.ftruncate(self._file, place + size)
         os.fsync(self._file)
-        self.size = place + len(block)
-        self._waiting.base += len(data)
-        data.clear()
+        self.size = place + size
+        waiting.base += len(waiting.data)
+        waiting.data.clear()
 
-    def _metadata(self) -> dict[str, Any]:
-        """Contents of metadata.yaml below its one key, version 9."""
-        # rosbag2 says the end of time for the start of an empty bag.
-        start = {'nanoseconds_since_epoch': NO_START if self.start is None else self.start}
-        duration = {'nanoseconds': (self.end or 0) - (self.start or 0)}
-        return {
-            'version': METADATA_VERSION,
-            'storage_identifier': 'mcap',
-            'duration': duration,
-            'starting_time': start,
-            'message_count': self.count,
-            'topics_with_message_count': [
-                {
-                    'topic_metadata': {
-                        'name': topic.name,
-                        'type': topic.type_name,
-                        'serialization_format': 'cdr',
-                        'offered_qos_profiles': yaml.safe_load(topic.qos) or [],
-                        'type_description_hash': topic.type_hash,
-                    },
-                    'message_count': topic.count,
-                }
-                for topic in self._topics.values()
-            ],
-            'compression_format': '',
-            'compression_mode': '',
-            'relative_file_paths': [self.path.name],
-            'files': [
-                {
-                    'path': self.path.name,
-                    'starting_time': dict(start),
-                    'duration': dict(duration),
-                    'message_count': self.count,
-                }
-            ],
-            'custom_data': None,
-            'ros_distro': ROS_DISTRO,
-        }
-
-    def _write_metadata(self) -> None:
-        """Replace metadata.yaml as a whole, so that it is never half written."""
-        path = self.path.with_name('metadata.yaml')
-        draft = path.with_name('metadata.yaml.tmp')
-        content = {'rosbag2_bagfile_information': self._metadata()}
-        with draft.open('w', encoding='utf-8') as file:
-            yaml.safe_dump(content, file, sort_keys=False)
-            file.flush()
-            os.fsync(file.fileno())
-        draft.replace(path)
+    def _metadata(self) -> dict:
+        return bag_metadata(self.path.name, self._topics.values(), self.start, self.end)
 
 
 def _end_without_index() -> bytes:
@@ -280,11 +236,3 @@ def _end_without_index() -> bytes:
     ).finish()
     return stream.getvalue()
 
-
-def _sync_folder(folder: Path) -> None:
-    """Make the entries of a directory survive a power failure."""
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)

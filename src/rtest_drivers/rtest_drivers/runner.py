@@ -71,12 +71,7 @@ def run_session(settings: GraphSettings, domain: int) -> bool:
 
     Raises UserError for a user's mistake, NodeFailed, Stopped.
     """
-    for module, remedy in (
-        ('rclpy', 'source a ROS 2 set-up or run `make demo` once'),
-        ('rtest_msgs', 'build src/rtest_msgs with `colcon build` or run `make demo` once'),
-    ):
-        if find_spec(module) is None:
-            raise UserError(f'cannot import {module}, which a session needs; {remedy}')
+    need_ros()
     remove_leftovers()
     environment = session_environment(settings.simulate is not None, domain)
     commands = [
@@ -93,6 +88,16 @@ def run_session(settings: GraphSettings, domain: int) -> bool:
         for node in session_nodes(settings)
     ]
     return run(commands, environment=environment, leftovers=(settings.address,))
+
+
+def need_ros() -> None:
+    """Raise UserError where there is no ROS or no interface package."""
+    for module, remedy in (
+        ('rclpy', 'source a ROS 2 set-up or run `make demo` once'),
+        ('rtest_msgs', 'build src/rtest_msgs with `colcon build` or run `make demo` once'),
+    ):
+        if find_spec(module) is None:
+            raise UserError(f'cannot import {module}, which nodes need; {remedy}')
 
 
 def run(

@@ -26,6 +26,21 @@ FIRST_S = 60.0
 # The poses are told once a second of wall time, on a busy computer later: what was not heard of
 # for less is no sign [s].
 HEARD_S = 6.0
+# A repeated cycle that begins so much before or after its time is in time [s].
+IN_TIME_S = 5.0
+
+
+def turn(due: int, now: int) -> tuple[str, bool]:
+    """How a repeated cycle that is to begin at `due` [ns] is told, '' where that is now.
+
+    Beside it whether it is late.
+    """
+    ahead = (due - now) / NANOSECONDS
+    if abs(ahead) <= IN_TIME_S:
+        return '', False
+    if ahead > 0.0:
+        return f'in {ahead / 60.0:.1f} min', False
+    return f'{-ahead / 60.0:.1f} min late: the cycle before it had not finished', True
 
 
 def path_duration(plan: CyclePlan) -> float:

@@ -11,9 +11,11 @@ from rtest_drivers.backends import CNC_BACKENDS, GAUGE_BACKENDS, make
 from rtest_drivers.cell_link import (
     CNC,
     GAUGES,
+    THERMOMETERS,
     CellCnc,
     CellGauges,
     CellServer,
+    CellThermometers,
     LinkError,
     decode,
     encode,
@@ -21,7 +23,7 @@ from rtest_drivers.cell_link import (
 from rtest_drivers.rate import Rate
 from rtest_drivers.sequence import Sequence
 from rtest_estimation.errors import UserError
-from rtest_estimation.records import Feedback, GaugeBlock
+from rtest_estimation.records import Feedback, GaugeBlock, Temperature
 
 
 def block(sequence: int = 0, channels: int = 3) -> GaugeBlock:
@@ -70,6 +72,21 @@ def test_records_survive_the_wire() -> None:
     assert (second.stamp, second.axes) == (5, sent[1].axes)
     assert np.array_equal(second.position, sent[1].position)
     assert decode(b'') == []
+
+
+def test_temperatures_come_over_a_channel_of_their_own(server, address) -> None:
+    sent = [Temperature(7, 'B_cover', 23.25, 0.01), Temperature(8, 'ambient', -1.5)]
+    data = encode([sent[0], feedback(), sent[1]])
+    assert [r for r in decode(data) if isinstance(r, Temperature)] == sent
+    for damaged in (data[:-1], data[:12]):
+        with pytest.raises(LinkError, match='damaged'):
+            decode(damaged)
+    thermometers = CellThermometers(address)
+    thermometers.open()
+    wait_for(lambda: server.connected == (THERMOMETERS,))
+    server.send(THERMOMETERS, sent)
+    assert thermometers.read(1.0) == sent
+    thermometers.close()
 
 
 @pytest.mark.parametrize('cut', [1, 20, 60, 300])

@@ -1,6 +1,7 @@
 """Clocks, and the joining of axes that are told one by one."""
 
 import math
+import re
 import time
 
 import numpy as np
@@ -77,6 +78,28 @@ def test_recent_forgets(monkeypatch: pytest.MonkeyPatch) -> None:
     assert recent.largest == 2
     now[0] += 5.0
     assert recent.largest == 0
+
+
+@pytest.mark.parametrize(
+    ('step', 'way'), [(10.0, 'forward'), (0.25, 'forward'), (-0.15, 'back'), (-10.0, 'back'),
+                      (0.03, ''), (-0.03, '')],
+)
+def test_a_clock_that_is_set_is_told_and_followed(step: float, way: str) -> None:
+    """Messages every 50 ms with up to 40 ms under way."""
+    rng, clock = np.random.default_rng(3), DeviceClock()
+    said, late = '', 0
+    for number in range(200):
+        host = 10**12 + number * 50 * MS
+        ahead = round(step * 1e9) if number >= 100 else 0
+        (stamp,) = clock.to_host([host + ahead], host + round(rng.uniform(0, 40)) * MS)
+        late = stamp - host
+        assert number >= 100 or clock.problem() == ''
+        said = said or clock.problem()
+    assert bool(said) == bool(way)
+    if way:
+        found = re.search(f'was set {way} by ([0-9.]+) s', said)
+        assert float(found[1]) == pytest.approx(abs(step), abs=0.04)
+    assert abs(late) < 40 * MS
 
 
 def test_axes_keep_their_value_and_close_samples_are_one_feedback() -> None:

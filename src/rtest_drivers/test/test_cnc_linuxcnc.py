@@ -1,5 +1,6 @@
 """The backend 'linuxcnc': the language, and faults of a server of our own."""
 
+import contextlib
 import math
 import random
 import socket
@@ -77,7 +78,8 @@ def test_answers() -> None:
     assert now.homed == (True, True, False)
 
 
-@pytest.mark.parametrize('words', ['', 'nan 1.0', '1.0 inf', '1.0 2', '0x1 1.0', '1.0 -', '1e3'])
+@pytest.mark.parametrize('words', ['', 'nan 1.0', '1.0 inf', '1.0 2', '0x1 1.0', '1.0 -', '1e3',
+                                   '٣.0'])
 def test_bad_numbers_are_no_numbers(words: str) -> None:
     with pytest.raises(ReplyError):
         positions(words)
@@ -164,6 +166,15 @@ def test_feedback_is_in_si_and_stamped_at_the_read(
     assert backend.problem() == ''
     # It only looks on.
     assert not any('enable' in request for request in server.requests)
+
+
+@pytest.mark.parametrize('value', [1e300, -1e6, math.inf])
+def test_a_number_that_is_no_position_is_refused(
+    backend: LinuxCnc, server: LinuxCncServer, value: float
+) -> None:
+    server.position = [1.0, 1e300, value, 0.0, 0.0, 0.0]  # The second joint is no axis.
+    with pytest.raises(ConnectionError, match='no position|told as'):
+        follow(backend, 0.5)
 
 
 def test_an_answer_with_fewer_joints_is_refused(
@@ -294,7 +305,14 @@ def test_units_and_joints_are_held_to_the_controller(
     server.units = 'INCH INCH INCH DEG DEG INCH'
     with pytest.raises(ConnectionError, match='X: unit: LinuxCNC says inch, the device file mm'):
         LinuxCnc(path).open()
-    server.units = 'CUSTOM MM MM DEG'
+    for word in ('CM', 'CUSTOM'):
+        server.units = f'{word} MM MM DEG'
+        with pytest.raises(ConnectionError, match=f'X: unit: LinuxCNC says {word}, expected one'):
+            LinuxCnc(path).open()
+    server.units = 'MM'
+    with pytest.raises(ConnectionError, match='Z: unit: LinuxCNC says nothing, expected one of'):
+        LinuxCnc(path).open()
+    server.units = 'MM MM MM DEG'
     server.position = [0.0] * 3
     with pytest.raises(ConnectionError, match='B: index 3: LinuxCNC tells joints 0 to 2 only'):
         LinuxCnc(path).open()
@@ -341,8 +359,36 @@ def test_a_server_that_says_something_else(tmp_path: Path) -> None:
         thread.start()
         path = tmp_path / 'cnc.yaml'
         path.write_text(FILE.format(port=listener.getsockname()[1]))
-        with pytest.raises(ConnectionError, match='does not let us in'):
+        with pytest.raises(ConnectionError, match='is none, it says .*set host and port'):
             LinuxCnc(str(path)).open()
+        thread.join()
+
+
+@pytest.mark.parametrize('noise', [b'NOISE 1\r\n', b'\r\n'])
+def test_a_server_that_never_stops_talking(tmp_path: Path, noise: bytes) -> None:
+    """It says hello as it should; then something comes every few milliseconds."""
+    stop = threading.Event()
+    answers = {b'hello': b'HELLO ACK EMCNETSVR 1.1\r\n', b'set': b'set echo off\r\n',
+               b'get': b'ECHO OFF\r\n'}
+
+    def serve() -> None:
+        client, _ = listener.accept()
+        with client, client.makefile('rb') as lines, contextlib.suppress(OSError):
+            for line in lines:
+                if b'echo' in line or b'hello' in line:
+                    client.sendall(answers[line.split()[0]])
+                    continue
+                while not stop.wait(0.005):
+                    client.sendall(noise)
+
+    with socket.create_server(('127.0.0.1', 0)) as listener:
+        thread = threading.Thread(target=serve)
+        thread.start()
+        path = tmp_path / 'cnc.yaml'
+        path.write_text(FILE.format(port=listener.getsockname()[1]))
+        with pytest.raises(ConnectionError, match='talks without being asked|answer'):
+            LinuxCnc(str(path)).open()
+        stop.set()
         thread.join()
 
 

@@ -1,6 +1,9 @@
 """The backend 'mtconnect': documents, and an agent of our own over HTTP."""
 
+import contextlib
 import math
+import socket
+import threading
 import time
 from datetime import datetime, timezone
 from pathlib import Path
@@ -10,6 +13,7 @@ import pytest
 
 from rtest_drivers.cnc.check import check
 from rtest_drivers.cnc.mtconnect import MtConnect
+from rtest_drivers.cnc.mtconnect_agent import Agent
 from rtest_drivers.cnc.mtconnect_xml import (
     DocumentError,
     Header,
@@ -93,7 +97,7 @@ def test_devices() -> None:
     header, devices = parse_devices(PROBE)
     assert header.instance == 7 and header.size == 131072
     assert [list(items) for items in devices] == [['av1'], ['x2']]
-    assert devices[1]['x2'] == Item('x2', 'Xact', 'POSITION', 'MILLIMETER')
+    assert devices[1]['x2'] == Item('x2', 'Xact', 'POSITION', 'MILLIMETER', 'ACTUAL')
 
 
 def test_errors_of_the_agent() -> None:
@@ -114,14 +118,17 @@ def test_times(text: str, ns: int) -> None:
 
 
 @pytest.mark.parametrize('text', ['', 'now', '2010-13-01T00:00:00Z', '2010-09-29 23:59:33',
-                                  '2010-09-29T23:59:61Z', '2010-09-29T23:59:33Z@100.0'])
+                                  '2010-09-29T23:59:61Z', '2010-09-29T23:59:33Z@100.0',
+                                  '0001-01-01T00:00:00+01:00', '9999-12-31T23:59:59-01:00',
+                                  '٢010-09-29T23:59:33Z'])
 def test_bad_times(text: str) -> None:
     with pytest.raises(DocumentError):
         parse_time(text)
 
 
 @pytest.mark.parametrize(
-    'text', ['', 'nan', 'inf', '1,5', '1.5 2.5 3.5', '0x10', '1_000', '--1', '1e', 'UNAVAILABLE']
+    'text', ['', 'nan', 'inf', '1,5', '1.5 2.5 3.5', '0x10', '1_000', '--1', '1e', 'UNAVAILABLE',
+             '٣', '1٣.5']
 )
 def test_what_is_no_number(text: str) -> None:
     assert Observation('x', 0, text).number is None
@@ -266,6 +273,92 @@ def test_unavailable_estop_and_adapter(backend: MtConnect, agent: MtConnectAgent
     agent.observe({'avail': 'AVAILABLE'})
     follow(backend, 0.1)
     assert backend.problem() == ''
+
+
+@pytest.mark.parametrize('said', ['1e999', '-1E400', '12' * 400, '1000001', '٣'])
+def test_a_number_that_is_no_position_stops_feedback(
+    backend: MtConnect, agent: MtConnectAgent, said: str
+) -> None:
+    follow(backend, 0.05)
+    agent.observe({'Xact': said})
+    follow(backend, 0.05)
+    assert follow(backend, 0.1) == []
+    assert f'axis X: the agent says {said[:40]}, so there is no feedback' in backend.problem()
+
+
+def test_estop_is_on_while_any_is_triggered(tmp_path: Path) -> None:
+    agent = MtConnectAgent({**ITEMS, 'es2': ('EMERGENCY_STOP', '')})
+    agent.observe({'avail': 'AVAILABLE', 'Xact': 1.0, 'Bact': 90.0})
+    backend = MtConnect(device(tmp_path, agent))
+    backend.open()
+    # Nothing is known yet, so nothing is wrong yet.
+    assert backend.problem() == '' and backend.told()['estop'] == 'unknown'
+    for items, state in (
+        ({'es': 'ARMED'}, 'unknown'), ({'es2': 'ARMED'}, 'off'), ({'es': 'TRIGGERED'}, 'on'),
+        ({'es2': 'ARMED'}, 'on'), ({'es': 'UNAVAILABLE'}, 'unknown'),
+    ):
+        agent.observe(items)
+        follow(backend, 0.05)
+        assert backend.told()['estop'] == state
+        assert ('E-stop is on' in backend.problem()) == (state == 'on')
+    backend.close()
+    agent.close()
+
+
+def test_items_that_are_not_the_position_of_one_axis(
+    tmp_path: Path, agent: MtConnectAgent, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    probe = agent._probe
+    name = b'name="nXact"'
+    for old, new, said in (
+        (name, b'name="nBact"', 'B: item .nBact.: the agent has 2 items of this name.*Xact, Bact'),
+        (name, name + b' subType="COMMANDED"', 'X: item .Xact.: its subType is COMMANDED'),
+        (b'</Devices>', probe()[probe().index(b'<Device '):probe().index(b'</Devices>')]
+         + b'</Devices>', 'several devices with these items; set device'),
+    ):
+        changed = probe().replace(old, new)
+        assert changed != probe()
+        monkeypatch.setattr(agent, '_probe', lambda changed=changed: changed)
+        with pytest.raises(ConnectionError, match=said):
+            MtConnect(device(tmp_path, agent)).open()
+        monkeypatch.setattr(agent, '_probe', probe)
+
+
+def test_a_next_sequence_that_stays_is_refused(
+    backend: MtConnect, agent: MtConnectAgent, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    follow(backend, 0.05)
+    header = agent._header
+    monkeypatch.setattr(agent, '_header', lambda following: header(1))
+    agent.observe({'Xact': 2.0})
+    with pytest.raises(ConnectionError, match='says that 1 is the next after'):
+        follow(backend, 1.0)
+
+
+@pytest.mark.parametrize(
+    'sent', [(b'HTTP/1.1 200 OK\r\nContent-Length: 1000000\r\n\r\n', b'<'),
+             (b'HTTP/1.1 200 OK\r\n', b'X: y\r\n'), (b'', b'HTTP/1.1 100 Continue\r\n\r\n')],
+    ids=['body', 'header', 'continue'],
+)
+def test_an_answer_that_never_ends_is_given_up(sent: tuple[bytes, bytes]) -> None:
+    """Some bytes before every time-out of the socket."""
+    stop = threading.Event()
+    with socket.create_server(('127.0.0.1', 0)) as listener:
+        def serve() -> None:
+            client, _ = listener.accept()
+            with client, contextlib.suppress(OSError):
+                client.recv(4096)
+                client.sendall(sent[0])
+                while not stop.wait(0.05):
+                    client.sendall(sent[1])
+
+        thread = threading.Thread(target=serve)
+        thread.start()
+        agent = Agent(f'http://127.0.0.1:{listener.getsockname()[1]}')
+        with pytest.raises(ConnectionError, match='timed out|not complete in time'):
+            agent.get('current', 0.3)
+        stop.set()
+        thread.join()
 
 
 def test_overwritten_observations_are_a_loss_that_is_told(

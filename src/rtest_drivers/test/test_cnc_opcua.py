@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 from asyncua import ua
 
+from rtest_drivers.cnc.axes import AxisSource
 from rtest_drivers.cnc.check import check
-from rtest_drivers.cnc.opcua import OpcUa, position, source_time
+from rtest_drivers.cnc.opcua import OpcUa, estop_state, position, source_time
 from rtest_drivers.sim.cnc_devices import OpcUaServer
 
 # In the style of a SINUMERIK: position of the first encoder of machine axes 1 and 4.
+X = AxisSource('X', 'ns=2;s=x', 'mm')
 NODES = {
     'X': '/Channel/MachineAxis/measPos1[u1,1]', 'B': '/Channel/MachineAxis/measPos1[u1,4]',
     'E': '/Plc/E10.0',
@@ -32,19 +34,41 @@ estop: {{node: 'ns=2;s=/Plc/E10.0', value: 1.0}}
     ('value', 'number', 'why'),
     [
         (1.5, 1.5, ''), (3, 3.0, ''), (True, None, 'bool'), ('1.5', None, 'str'),
-        (None, None, 'NoneType'), ([1.0, 2.0], None, 'list'), (math.nan, None, 'not finite'),
+        (None, None, 'no value'), (1e300, None, '1e+300 mm'),
+        ([1.0, 2.0], None, 'list'), (math.nan, None, 'not finite'),
         (-math.inf, None, 'not finite'),
     ],
 )
 def test_positions(value: object, number: float | None, why: str) -> None:
-    found, said = position(ua.DataValue(ua.Variant(value)))
+    found, said = position(ua.DataValue(ua.Variant(value)), X)
     assert found == number and why in said
 
 
 def test_only_good_values_are_positions() -> None:
     for name in ('BadSensorFailure', 'UncertainLastUsableValue', 'BadOutOfService'):
         status = ua.StatusCode(getattr(ua.StatusCodes, name))
-        assert position(ua.DataValue(ua.Variant(1.0), StatusCode=status)) == (None, name)
+        assert position(ua.DataValue(ua.Variant(1.0), StatusCode=status), X) == (None, name)
+
+
+@pytest.mark.parametrize(
+    ('said', 'on', 'state', 'why'),
+    [
+        (True, True, True, ''), (False, True, False, ''), (1, True, True, ''), (0.0, 1, False, ''),
+        ('stop', 'stop', True, ''), ('run', 'stop', False, ''),
+        # Could never be the value of the device file.
+        (1.0, '1', None, "float 1.0 is never '1'"), ('true', True, None, 'is never True'),
+        ([True], True, None, 'list'), (None, True, None, 'no value'),
+    ],
+)
+def test_estop_is_on_off_or_not_known(
+    said: object, on: bool | float | str, state: bool | None, why: str
+) -> None:
+    found, reason = estop_state(ua.DataValue(ua.Variant(said)), on)
+    assert found is state and why in reason and bool(reason) == (state is None)
+    bad = ua.StatusCode(ua.StatusCodes.BadNoCommunication)
+    value = ua.DataValue(ua.Variant(said), StatusCode=bad)
+    assert estop_state(value, on) == (None, 'BadNoCommunication')
+    assert estop_state(ua.DataValue(Value=None), on) == (None, 'no value')
 
 
 def test_source_times() -> None:
@@ -174,6 +198,59 @@ def test_estop_is_told_while_feedback_goes_on(backend: OpcUa, server: OpcUaServe
     assert backend.problem() == ''
 
 
+def test_estop_without_a_good_value_is_not_off(backend: OpcUa, server: OpcUaServer) -> None:
+    assert backend.told()['estop'] == 'unknown'
+    follow(backend, 0.2)
+    assert backend.told()['estop'] == 'off'
+    server.write({'E': 0.0}, bad='BadNoCommunication')
+    assert follow(backend, 0.3)
+    assert backend.told()['estop'] == 'unknown'
+    assert backend.problem() == (
+        'estop: the controller has no good value (BadNoCommunication), so an E-stop would not be '
+        'seen; look at the node in the server'
+    )
+
+
+@pytest.mark.parametrize('fault', ['end_subscriptions', 'stop_publishing'])
+def test_a_dead_subscription_is_a_lost_connection(
+    backend: OpcUa, server: OpcUaServer, fault: str
+) -> None:
+    """The server still answers every question."""
+    assert follow(backend, 0.3)
+    getattr(server, fault)()
+    died, feedback = time.time_ns(), []
+    server.write({'X': 99.0})
+    with pytest.raises(ConnectionError, match='subscription nothing has come for'):
+        while time.time_ns() - died < 5e9:
+            feedback += backend.read(0.1)
+    assert all(one.stamp < died for one in feedback)
+    with pytest.raises(ConnectionError):
+        backend.read(0.1)
+    backend.close()
+    backend.open()
+    assert follow(backend, 0.5)[-1].position[0] == pytest.approx(0.099)
+
+
+def test_a_server_that_is_not_running(backend: OpcUa, server: OpcUaServer) -> None:
+    assert follow(backend, 0.3)
+    server.state(3)
+    with pytest.raises(ConnectionError, match='is not running, its state is'):
+        follow(backend, 2.0)
+    server.state(0)
+
+
+def test_a_frozen_server_is_told_before_it_comes_back(
+    backend: OpcUa, server: OpcUaServer
+) -> None:
+    assert follow(backend, 0.3)
+    server.freeze(2.0)
+    frozen = time.monotonic()
+    with pytest.raises(ConnectionError, match='lost OPC UA server'):
+        follow(backend, 5.0)
+    # Goodbye is not waited for.
+    assert time.monotonic() - frozen < 2.0
+
+
 def test_clock_of_the_controller_set_back(backend: OpcUa, server: OpcUaServer) -> None:
     follow(backend, 0.2)
     stamps = []
@@ -212,7 +289,6 @@ def test_wrong_node_and_wrong_url(tmp_path: Path, server: OpcUaServer) -> None:
         ('[u1,4]', '[U1,4]', "B: node 'ns=2;s=/Channel/MachineAxis/measPos1.*correct the device"),
         ("'ns=2;s=/Channel/MachineAxis/measPos1[u1,1]'", 'nonsense', "X: node 'nonsense'"),
         (server.url, 'opc.tcp://127.0.0.1:9', 'no OPC UA server opc.tcp://127.0.0.1:9'),
-        (server.url, 'http://127.0.0.1:9', 'no OPC UA server http://127.0.0.1:9'),
     ):
         assert old in text
         Path(path).write_text(text.replace(old, new))

@@ -3,6 +3,7 @@
 import argparse
 import json
 import re
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from correction_case import (
     B,
     C,
     X,
+    effect,
     identified,
     known_errors,
     model,
@@ -213,6 +215,89 @@ def test_along_corrected_blocks_the_tool_stays_on_its_way(known, tmp_path):
     assert worst[0] > 3e-5 and worst[1] < 8e-7
 
 
+def words_of(line):
+    return {name: float(value) for name, value in re.findall(r'([XYZBC])(-?[\d.]+)', line)}
+
+
+def off_along(text, start, end, errors):
+    """Worst distance from its way of a tool that runs a program's G1 blocks, by the simulation.
+
+    The program was one straight block from start to end, of which C alone moves.
+    """
+    rows = np.array([[words_of(line)[n] for n in 'XYZBC'] for line in text.splitlines()
+                     if line[:1] in 'GX' and words_of(line)]) * ([1e-3] * 3 + [np.pi / 180] * 2)
+    share = np.linspace(0.0, 1.0, 41)[:, None]
+    run = np.concatenate([a + share * (b - a) for a, b in pairwise(rows)])
+    meant = np.tile(start, (len(run), 1))
+    meant[:, C] = np.clip(run[:, C], start[C], end[C])
+    off = sphere_in_table(MACHINE, run, errors) - sphere_in_table(MACHINE, meant)
+    return np.linalg.norm(off, axis=1).max(), len(rows) - 1
+
+
+def test_a_block_as_long_as_the_period_of_an_error_is_cut(tmp_path):
+    # Four times a turn, seen every quarter of one: the same at all of these points.
+    known = of_model(model(effect('radial/C.4', a_X=(1e-5, 'm'), b_X=(0.0, 'm'), a_Y=(0.0, 'm'),
+                                  b_Y=(0.0, 'm'))), MACHINE)
+    errors = GeometricErrors({}, {'E_X(B)C': (Term('harmonic', 'C', 4, 1e-5, 0.0),)})
+    text = 'G0 X50 Y0 Z50 B0 C0\nG1 X50 Y0 Z50 B0 C360 F500\nM2\n'
+    start, end = np.array([0.05, 0.0, 0.05, 0.0, 0.0]), np.array([0, 0, 0, 0, 2.0 * np.pi])
+    before, _ = off_along(text, start, end, errors)
+    made = rewrite(tmp_path / 'p.ngc', text, known)
+    after, pieces = off_along(made.text, start, end, errors)
+    assert before == pytest.approx(1e-5, rel=1e-3) and pieces > 40
+    assert after < 2.5e-7
+    # What is told is what is found along the way, rounding of the words included.
+    told = np.linalg.norm(made.along.after.shift, axis=1).max()
+    assert 0.6 * after < told <= 1.001 * after
+    assert np.linalg.norm(made.along.before.shift, axis=1).max() == pytest.approx(before, rel=1e-2)
+
+
+def test_even_an_error_of_the_period_of_the_points_is_found(tmp_path):
+    def worm(positions, approach):
+        errors = np.zeros((len(positions), 5, 6))
+        errors[:, C, 3] = 2e-6 * np.sin(360.0 * positions[:, C])
+        return errors
+
+    known = KnownErrors(MACHINE, worm, lambda p: np.ones(len(p), dtype=bool))
+    made = rewrite(tmp_path / 'p.ngc', 'G0 X50 Y0 Z50 B0 C0\nG1 C10 F500\nM2\n', known)
+    moves = read_blocks(tmp_path / 'p.ngc', made.text, MACHINE)
+    # Sagitta of a chord of a sine: amplitude * (order * length)^2 / 8 on its crest.
+    assert 2e-6 * (360.0 * np.diff(moves.end[:, C])).max() ** 2 / 8.0 < 2e-7
+    assert np.linalg.norm(made.along.after.shift, axis=1).max() < 2.5e-7
+
+
+def test_play_is_taken_up_before_the_tool_goes_back(tmp_path):
+    known = of_model(model(effect('backlash/X', h=(2e-5, 'm'))), MACHINE)
+    text = 'G0 X-10 Y0 Z50 B0 C0\nG0 X0\nG1 X50 F500\nX0\nM2\n'
+    made = rewrite(tmp_path / 'p.ngc', text, known)
+    rows = [words_of(line) for line in made.text.splitlines() if not line.startswith('(')]
+    # Half of it too far each way.
+    assert [row['X'] for row in rows if row] == pytest.approx([-10, -0.01, 49.99, 50.01, 0.01])
+    timed = rewrite(tmp_path / 'p.ngc', text.replace('G1', 'G93 G1').replace('X0\nM2',
+                                                                             'X0 F2\nM2'), known)
+    assert [line.rpartition('F')[2] for line in timed.text.splitlines()[4:6]] == [
+        '60000.000', '2.000']
+
+
+def test_a_dwell_moves_nothing(tmp_path, known):
+    text = 'G0 X0 Y0 Z150 B5 C0\nG4 X1\nG4 P0.5\nG1 X-20 F500\nM2\n'
+    nominal = read_blocks(tmp_path / 'p.ngc', text, MACHINE)
+    assert nominal.start[0, X] == 0.0 and len(nominal.end) == 1
+    lines = rewrite(tmp_path / 'p.ngc', text, known).text.splitlines()
+    assert lines[2:4] == ['G4 X1', 'G4 P0.5']
+    for line in ('G4 X1 Y2', 'G1 G4 X1', 'G4 P1 X1', 'G4 B1'):
+        with pytest.raises(UserError, match=r'p\.ngc:2: a dwell \(G4\) in one block with a move'):
+            read_blocks(tmp_path / 'p.ngc', text.replace('G4 X1', line), MACHINE)
+
+
+def test_a_number_with_a_comment_stays_first_and_a_percent_sign_ends(tmp_path, known):
+    text = '%\nO0007 (PART A)\n(B)\nG0 X0 Y0 Z150 B5 C0\nG1 X-20 F500\n%\nX100\n'
+    lines = rewrite(tmp_path / 'p.ngc', text, known).text.splitlines()
+    assert lines[:2] == ['%', 'O0007 (PART A)'] and lines[3] == '(B)'
+    assert lines[2].startswith('(POSITIONS CORRECTED')
+    assert lines[-2:] == ['%', 'X100']
+
+
 def test_a_block_with_a_stop_stays_whole_and_is_told(known, tmp_path):
     text = 'G0 X10 Y-20 Z150 B5 C0\nG1 B70 F500 M8\nB-70 M0\nX11 M0\nM2\n'
     made = rewrite(tmp_path / 'p.ngc', text, known)
@@ -233,11 +318,15 @@ def test_a_program_that_says_something_else_is_refused(known, tmp_path, line, ma
 
 @pytest.mark.parametrize('controller', ['linuxcnc', 'iso'])
 def test_a_path_becomes_a_program(known, tmp_path, controller):
-    found = correct(MACHINE, CONE.positions, known.at(CONE.positions, CONE.approach))
-    text = path_program(CONE, found, 1.0 / 60.0, controller)
+    wanted = correct(MACHINE, CONE.positions, known.at(CONE.positions, CONE.approach))
+    made = path_program(CONE, known, 1.0 / 60.0, controller)
+    text = made.text
+    assert made.correction.positions == pytest.approx(wanted.positions, abs=1e-12)
     if controller == 'linuxcnc':
         blocks = read_blocks(tmp_path / 'p.ngc', text.replace('G1 X', 'G0 X', 1), MACHINE)
-        assert blocks.end == pytest.approx(found.positions[1:], abs=1e-7)
+        # Every point is still gone through, whether a move was cut or not.
+        off = np.abs(blocks.end[:, None] - wanted.positions[1:]).max(axis=2).min(axis=0)
+        assert off.max() < 2e-7 and len(blocks.end) >= 89
     feeds = [float(line.rpartition('F')[2]) for line in text.splitlines()
              if line.startswith('G1')][1:]
     way = np.linalg.norm(np.diff(CONE.feature.tip, axis=0), axis=1).sum()
@@ -295,6 +384,40 @@ def test_the_command_corrects_paths(identification, tmp_path, capsys):
     assert 'line 5: not corrected' in capsys.readouterr().out
 
 
+def test_what_is_told_of_a_path_is_of_that_path(identification, tmp_path, capsys):
+    path = tmp_path / 'k.ngc'
+    path.write_text('G0 X0 Y104.999 Z150 B0 C0\nG1 X60 F500\nC90\nM2\n')
+    assert run('--identification', identification, '--path', path, '--out', tmp_path / 'o') == 0
+    told = capsys.readouterr().out.splitlines()
+    data = json.loads((tmp_path / 'o/correction.json').read_text())
+    mine = data['predicted']['k.ngc']
+    files = data['compensation_files']['predicted_with_them_alone']['k.ngc']
+    (line,) = (line for line in told if 'compensation files alone' in line and '->' in line)
+    assert line.startswith('  k.ngc, compensation files alone')
+    assert f'-> {files["after"]["shift"] * 1e6:.3f} µm' in line
+    assert files['after']['shift'] < files['before']['shift']
+    assert not any(line.startswith('  warning') for line in told)
+    # The largest along the way, and what a workpiece zero cannot take away.
+    assert f'{mine["after"]["shift_largest"] * 1e6:.3f} at most' in told[-1]
+    assert mine['placed'] < 0.5 * mine['before']['shift']
+    # A hundredth of a millimetre over the end of Y is seen, and who takes it there.
+    (note,) = (line for line in told if 'its range is -105 to 105' in line)
+    assert re.search(r'to 105\.01\d\d mm', note) and 'the correction that takes it there' in note
+    assert 'the machine cannot run it, out of range: Y' in told[-1]
+
+
+def test_files_that_make_a_path_worse_are_warned_of(tmp_path, capsys):
+    # 100 urad at 100 mm above B are 10 um along X, which the place of B makes up for.
+    save_model(model(**{'E_B(0Y)B': 1e-4, 'E_X(0Y)B': -1e-5}), tmp_path / 'model.yaml')
+    path = tmp_path / 'y.ngc'
+    path.write_text('G0 X0 Y0 Z100 B0 C0\nG1 Y50 F500\nM2\n')
+    assert run('--model', tmp_path / 'model.yaml', '--path', path, '--out', tmp_path / 'o') == 0
+    told = capsys.readouterr().out.splitlines()
+    (line,) = (line for line in told if 'compensation files alone:' in line)
+    assert 'tool point 0.00 ' in line and '-> 10.000 µm rms' in line
+    assert told[told.index(line) + 1].startswith('  warning: the compensation files alone make')
+
+
 def test_the_command_takes_a_model(tmp_path, capsys):
     save_model(model(SCALE, **VALUES), tmp_path / 'model.yaml')
     assert run('--model', tmp_path / 'model.yaml', '--at', 0, 0, 100, '--out', tmp_path / 'o') == 0
@@ -314,11 +437,13 @@ def test_mistakes_are_told_in_one_line(identification, tmp_path):
         (['--out', tmp_path / 'full'], 'is not empty'),
         (['--effects', 'e.yaml'], 'give the --model'),
         (['--plan', 'p.yaml', '--machine', 'm.yaml'], 'names the machine'),
-        (['--feed', '0'], 'positive'),
+        (['--path', 'p.csv', '--feed', '0'], 'positive'),
+        (['--path', far, '--feed', '500'], '--feed: is of a --path as CSV'),
+        (['--path', far, '--controller', 'iso'], '--controller: is of new programs'),
         (['--at', 'nan', '0', '0'], 'finite'),
         (['--at', '5000', '0', '0'], 'reaches none of these places'),
         (['--path', tmp_path / 'no.ngc'], 'cannot read'),
-        (['--path', far], 'outside the measured stations'),
+        (['--path', far], r'far\.ngc:2: B = 100, C = 0 deg is outside the measured stations of B'),
         (['--machine', config_path('head_table.yaml')], 'not an identification.json|is of mach'),
     ):
         with pytest.raises(UserError, match=match) as caught:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -13,6 +15,7 @@ from rtest_drivers.config import config_path
 from rtest_drivers.devices import check_devices
 from rtest_drivers.gauges.config import load_nest
 from rtest_drivers.graph import GraphSettings, session_nodes
+from rtest_estimation.errors import UserError
 from rtest_identification.session_file import load_session
 
 SESSION = """
@@ -71,6 +74,35 @@ def test_a_driver_without_a_device_is_expected_elsewhere(written) -> None:
     path.write_text(path.read_text().replace(f'  cnc: {CNC}\n', ''))
     assert 'gauges' in {node.name for node in session_nodes(settings(path))}
     assert 'cnc' not in {node.name for node in session_nodes(settings(path))}
+
+
+def test_thermometers_are_a_device_too(written, tmp_path: Path) -> None:
+    path = written()
+    path.write_text(
+        path.read_text() + '  thermometers: {backend: serial, file: thermometers.yaml}\n'
+    )
+    shutil.copy(config_path('thermometers_example.yaml'), tmp_path / 'thermometers.yaml')
+    config = load_session(path)
+    check_devices(config, path)
+    assert config.reads_temperatures(simulated=False)
+    (node,) = (n for n in session_nodes(settings(path)) if n.name == 'thermometers')
+    assert node.lifecycle and node.parameters['address'] == str(tmp_path / 'thermometers.yaml')
+    (tmp_path / 'thermometers.yaml').write_text('controllers: []')
+    with pytest.raises(UserError, match=r'thermometers.yaml: controllers: expected a list'):
+        check_devices(config, path)
+
+
+def test_a_thermal_session_has_its_own_node_and_simulated_thermometers() -> None:
+    path, truth = config_path('thermal.yaml'), config_path('cell_thermal.yaml')
+    session = load_session(path)
+    chosen = GraphSettings(path, 'warm', Path('/out'), simulate=truth).of(session)
+    nodes = {node.name: node for node in session_nodes(chosen)}
+    assert 'identifier' not in nodes and nodes['thermal'].parameters['out'] == '/out/warm/thermal'
+    assert nodes['thermometers'].parameters['backend'] == 'cell'
+    # On a machine without them temperatures may come from elsewhere, or not at all.
+    nodes = {node.name for node in session_nodes(replace(chosen, simulate=None))}
+    assert 'thermal' in nodes and 'thermometers' not in nodes
+    assert not session.reads_temperatures(simulated=False)
 
 
 def test_a_simulated_session_does_not_touch_the_devices(written) -> None:

@@ -41,7 +41,7 @@ def test_a_full_file(tmp_path) -> None:
     # What the file does not say is the factory setting.
     assert display.line == Line(9600, 7, 'even', 2)
     assert (display.signs, display.limits) == ((1,), None)
-    assert (laser.scale, display.scale) == (1e-3, 0.0254)
+    assert laser.physical(1, 0.25) == (-0.25e-3, '') and display.physical(0, 2.0) == (0.0508, '')
 
 
 def test_every_protocol_can_be_named(tmp_path) -> None:
@@ -70,7 +70,12 @@ def test_every_protocol_can_be_named(tmp_path) -> None:
         ('keyence-lkg', '[1]', r'1: protocol: expected one of .*, got \[1\]'),
         ('    unit: mm\n', '', '1: unit: missing'),
         ('unit: mm', 'unit: cm', "1: unit: expected one of .*, got 'cm'"),
-        ('/dev/ttyUSB0', '7', '1: port: expected a device or URL, got 7'),
+        ('/dev/ttyUSB0', '7', '1: port: expected a device, socket://HOST'),
+        *(('/dev/ttyUSB0', port, r'1: port: expected a device, socket://HOST:PORT or rfc2217://')
+          for port in ('socket://127.0.0.1', 'rfc2217://127.0.0.1', 'socket://127.0.0.1:99999',
+                       'socket://127.0.0.1:abc', 'socket://a..b:4001', 'foo://x:1', 'loop://',
+                       '"hwgrep://("', '"spy:///dev/ttyS0?file=x"', '"socket://[::1"',
+                       '"/dev/tty\\0"')),
         ('/dev/ttyUSB0', 'socket://10.0.0.7:4001', 'port socket://.* is given twice'),
         ('[1, 3]', '[1, 4]', r'channels: expected 1 to 3, each once, got \[1, 2, 4\]'),
         ('[1, 3]', '[1, 1]', r'channels: expected 1 to 3, each once, got \[1, 1, 2\]'),
@@ -94,6 +99,8 @@ def test_every_protocol_can_be_named(tmp_path) -> None:
         ('baud: 57600', 'parity: maybe', '1: parity: expected one of'),
         ('baud: 57600', 'stopbits: 3', '1: stopbits: expected a whole number from 1 to 2'),
         ('sampling_us: 100', 'sampling_us: 30', '1: sampling_us: expected one of'),
+        ('sampling_us: 100', 'sampling_us: [20]', '1: sampling_us: expected one of'),
+        ('sampling_us: 100', 'sampling_us: 100.0', '1: sampling_us: expected one of'),
         ('sampling_us: 100', 'command: ctrl-b', "1: unknown key 'command'"),
     ],
 )

@@ -252,10 +252,12 @@ def test_unit_of_the_frame_is_checked() -> None:
         (mitutoyo.digimatic, 1, {'query': 1}, 'query: expected ASCII text, got 1'),
         (line_protocol.line, 2, {**LINE, 'pattern': '('}, 'pattern: no regular expression'),
         (line_protocol.line, 2, {**LINE, 'pattern': '(.+)'}, 'pattern: expected one group'),
-        (line_protocol.line, 1, {**LINE, 'pattern': r'(\d+)+'}, 'a group must not be repeated'),
-        (line_protocol.line, 1, {**LINE, 'pattern': r'(?:a|a)*(\d)'}, 'must not be repeated'),
-        (line_protocol.line, 1, {**LINE, 'pattern': r'(a){2,}'}, 'must not be repeated'),
-        (line_protocol.line, 1, {**LINE, 'pattern': '.*.+(.)x.*'}, r'at most 2 times \.\*'),
+        (line_protocol.line, 1, {**LINE, 'pattern': r'(\d+)+'}, 'matching it could take too'),
+        (line_protocol.line, 1, {**LINE, 'pattern': r'(?:a|a)*(\d)'}, 'repeat no group'),
+        (line_protocol.line, 1, {**LINE, 'pattern': '.*.+(.).*x.*y.*'}, 'more than four'),
+        (line_protocol.line, 1, {**LINE, 'pattern': '[0-9]*' * 20 + '(x)'}, 'more than four'),
+        (line_protocol.line, 1, {**LINE, 'pattern': '[0-9]{0,9}' * 8 + '(x)'}, 'too long'),
+        (line_protocol.line, 1, {**LINE, 'pattern': '(?:' * 3000 + '(x)' + ')' * 3000}, 'deep'),
         (line_protocol.line, 2, {**LINE, 'query': ''}, 'expected at least one character'),
         (line_protocol.line, 2, {**LINE, 'terminator': 'µ'}, 'terminator: expected ASCII text'),
         (line_protocol.line, 2, {'query': '?'}, 'terminator: missing'),
@@ -266,6 +268,14 @@ def test_mistakes_in_the_device_file(make, outputs, keys, message) -> None:
         make(outputs, 'mm', options(**keys))
     assert str(caught.value).startswith('device.yaml: controllers: 1: ')
     assert '\n' not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    'pattern', [r'\s*([+-]?\d+\.\d{1,6})\s?mm', r'(?:[+-]\d{1,4}\.\d{4},){2}([+-]\d{1,4})',
+                r'(?:MM|IN)[.*+?]{3}(\S+)', r'(a){2}(?:bc){40}'],
+)
+def test_patterns_of_displays(pattern: str) -> None:
+    line_protocol.line(1, 'mm', options(**{**LINE, 'pattern': pattern}))
 
 
 def test_escaped_brackets_are_no_group() -> None:

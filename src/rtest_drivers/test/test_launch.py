@@ -75,6 +75,17 @@ def test_same_nodes_and_parameters_as_the_runner(launch_file, tmp_path):
         assert node.namespace == 'cell_1' and node.on_exit.kind == 'Shutdown'
 
 
+def test_the_estimator_is_told_of_which_kind_the_nest_is(launch_file, tmp_path):
+    for name, kind, radius in (('demo.yaml', 'contact', 12.7), ('laser.yaml', 'laser', 25.0)):
+        nodes = start(
+            launch_file, config=str(config_path(name)), out=str(tmp_path),
+            simulate=str(config_path('cell_demo.yaml')),
+        )
+        (parameters,) = next(n for n in nodes if n.name == 'estimator').parameters
+        assert parameters['nest'] == kind
+        assert parameters['sphere_radius_mm'] == pytest.approx(radius)
+
+
 def test_real_drivers_are_not_started(launch_file):
     assert not {'cell', 'gauges', 'cnc'} & {node.name for node in start(launch_file)}
 

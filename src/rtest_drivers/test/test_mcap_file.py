@@ -13,8 +13,9 @@ from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 
 from rtest_drivers import mcap_file
-from rtest_drivers.mcap_file import McapFile, RecordingFullError
+from rtest_drivers.mcap_file import McapFile
 from rtest_drivers.message_types import MessageTypes
+from rtest_estimation.mcap_scan import McapScan
 
 START = 1_700_000_000_000_000_000
 QOS = """\
@@ -180,15 +181,15 @@ def full_disk(monkeypatch, after):
     """Let `after` bytes through, then say that the disk is full."""
     left = [after]
 
-    def pwrite(handle, data, offset):
+    def pwritev(handle, parts, offset):
         if not left[0]:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        size = min(left[0], len(data))
-        left[0] -= size
-        return real(handle, data[:size], offset)
+        data = b''.join(parts)[: left[0]]
+        left[0] -= len(data)
+        return real(handle, [data], offset)
 
-    real = os.pwrite
-    monkeypatch.setattr(mcap_file.os, 'pwrite', pwrite)
+    real = os.pwritev
+    monkeypatch.setattr(mcap_file.os, 'pwritev', pwritev)
 
 
 @pytest.mark.parametrize('after', [0, 10, 500])
@@ -221,14 +222,23 @@ def test_full_disk_at_the_index(recording, monkeypatch):
     assert mcap_count(recording.path) == 50
 
 
-def test_memory_is_bounded_while_the_disk_is_full(recording, monkeypatch):
-    monkeypatch.setattr(mcap_file, 'MAX_WAITING', 1000)
-    full_disk(monkeypatch, 0)
-    with pytest.raises(RecordingFullError, match='wait for the disk'):
-        for round_ in range(100):
-            fill(recording, 20, 20 * round_)
-            with pytest.raises(OSError, match='No space'):
-                recording.flush()
+def test_losses_are_in_the_file_as_they_were_last_known(recording):
+    fill(recording, 10)
+    recording.note_losses({'not written /rtest/gauges': 3})
+    recording.flush()
+    fill(recording, 10, 10)
+    recording.note_losses({'not written /rtest/gauges': 7, 'not received /x': 1})
+    recording.note_losses({'not written /rtest/gauges': 7, 'not received /x': 1})
+    recording.flush()
+    for _ in ('open', 'closed'):
+        scan = McapScan(recording.path)
+        assert len(list(scan.entries())) == 20
+        assert scan.losses == {'not written /rtest/gauges': 7, 'not received /x': 1}
+        assert any('not written /rtest/gauges: 7' in warning for warning in scan.warnings)
+        recording.close()
+    with recording.path.open('rb') as file:
+        names = [record.name for record in make_reader(file).iter_metadata()]
+    assert names == ['rtest_losses', 'rtest_losses', 'rosbag2']
 
 
 def test_metadata_is_there_from_the_start(tmp_path):

@@ -11,6 +11,7 @@ import pytest
 import yaml
 
 from rtest_drivers import cli
+from rtest_drivers.cnc.programs import program_of
 from rtest_drivers.config import config_path
 from rtest_drivers.schedule import path_duration
 from rtest_drivers.sim.kinematics import sphere_in_table
@@ -81,6 +82,42 @@ def test_a_plan_can_be_measured_as_it_was_written(capsys, tmp_path):
         assert one.cycle == other.cycle
         np.testing.assert_allclose(one.commands, other.commands, atol=1e-10)
     np.testing.assert_allclose(np.degrees(again.stations[1]), UNEVEN_DEG)
+
+
+def test_a_thermal_session_has_one_program_for_all_its_cycles(capsys, tmp_path):
+    out_dir = tmp_path / 'plan'
+    status, out, err = run(
+        capsys, '--config', str(config_path('thermal.yaml')), '--out', str(out_dir)
+    )
+    assert status == 0 and not err
+    assert '13 times, every 15 min' in out
+    assert 'thermal plan, 27 poses, ' in out.splitlines()[-1]
+    assert ', 3 h 05 min, ' in out.splitlines()[-1]
+    assert sorted(path.name for path in out_dir.glob('*.ngc')) == [
+        'low-nest.ngc', 'low-runout.ngc', 'low-thermal.ngc',
+    ]
+    assert program_of('low-thermal-07', out_dir) == out_dir / 'low-thermal.ngc'
+    assert 'low-thermal-' not in (out_dir / 'low-thermal.ngc').read_text()
+    data = json.loads((out_dir / 'plan.json').read_text())
+    assert data['repeated'] == {'every': 900.0, 'cycles': 13}
+    again = load_session(out_dir / 'session.yaml')
+    assert [plan.cycle for plan in again.plans] == [
+        plan.cycle for plan in load_session(config_path('thermal.yaml')).plans
+    ]
+
+
+def test_a_cycle_that_takes_longer_than_its_turn_is_told_beforehand(tmp_path):
+    path = tmp_path / 'session.yaml'
+    text = config_path('thermal.yaml').read_text().replace('every_min: 15', 'every_min: 0.5')
+    machine = str(config_path('nmv1500dcg.yaml'))
+    path.write_text(text.replace('machine: nmv1500dcg.yaml', f'machine: {machine}'))
+    checked = check_session(load_session(path), NcSettings())
+    assert any('every 0.5 min: the cycles will be late' in w for w in checked.warnings)
+    # As one static cycle the file is as good.
+    once = load_session(path, 'static')
+    assert once.every == 0.0 and once.plans[-1].cycle == 'low-static'
+    write_plan(check_session(once, NcSettings()), tmp_path / 'once', 'once', NcSettings(), False)
+    assert load_session(tmp_path / 'once' / 'session.yaml').kind == 'static'
 
 
 def test_a_session_waits_longer_than_the_program_takes():

@@ -18,7 +18,7 @@ TOPIC = re.compile(r'/(?:rtest/[a-z_]+(?:/feedback)?|diagnostics|robot_descripti
 @pytest.mark.skipif(find_spec('rtest_msgs') is None, reason='needs ROS 2 and rtest_msgs')
 @pytest.mark.parametrize('name', ['foxglove_layout.json', 'plotjuggler_layout.xml'])
 def test_layouts_show_topics_that_exist(name) -> None:
-    from rtest_drivers.nodes.recorder import CONTRACT
+    from rtest_drivers.nodes.recorded_topics import CONTRACT
 
     text = config_path(name).read_text()
     json.loads(text) if name.endswith('json') else ET.fromstring(text)

@@ -313,6 +313,17 @@ def test_a_simulated_session_ignores_the_domain_and_range_of_the_environment(mon
     # A real machine is where the user's environment says.
     assert chosen_domain(False, None) == 42 and chosen_domain(True, 7) == 7
     assert session_environment(False, 42)['ROS_AUTOMATIC_DISCOVERY_RANGE'] == 'SUBNET'
+    assert 'FASTRTPS_DEFAULT_PROFILES_FILE' not in session_environment(False, 42)
+    # Where it says nothing, nobody listens to other hosts.
+    monkeypatch.delenv('ROS_STATIC_PEERS')
+    monkeypatch.delenv('ROS_AUTOMATIC_DISCOVERY_RANGE')
+    environment = session_environment(False, 42)
+    assert environment['ROS_AUTOMATIC_DISCOVERY_RANGE'] == 'LOCALHOST'
+    profile = Path(environment['FASTRTPS_DEFAULT_PROFILES_FILE']).read_text()
+    assert '<address>127.0.0.1</address>' in profile
+    monkeypatch.setenv('FASTRTPS_DEFAULT_PROFILES_FILE', 'mine.xml')
+    environment = session_environment(True, domain)
+    assert environment['FASTRTPS_DEFAULT_PROFILES_FILE'] == 'mine.xml'
 
 
 def test_a_second_session_in_a_domain_is_refused():

@@ -17,6 +17,7 @@ from rtest_drivers.schedule import (
     path_duration,
     pose_count,
     pose_patience,
+    turn,
 )
 from rtest_estimation.records import CyclePlan, Kind
 
@@ -93,3 +94,11 @@ def test_where_somebody_starts_the_machine_times_count_from_the_first_pose():
     assert not progress.stopped((hours + 12) * SECOND, hours + 12.0, 2, 0.02)
     why = progress.stopped((hours + 40) * SECOND, hours + 40.0, 2, 0.02)
     assert why == '2 of 3 poses, no other pose for 28 s'
+
+
+def test_a_repeated_cycle_is_announced_or_told_to_be_late():
+    now = 1_700_000_000_000_000_000
+    assert turn(now + 875 * SECOND, now) == ('in 14.6 min', False)
+    assert turn(now + 4 * SECOND, now) == turn(now - 4 * SECOND, now) == ('', False)
+    text, late = turn(now - 132 * SECOND, now)
+    assert late and text.startswith('2.2 min late: the cycle before')

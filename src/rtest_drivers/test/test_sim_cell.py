@@ -292,6 +292,80 @@ def test_stamps_and_sequence_are_contiguous() -> None:
     assert {b.stamp - a.stamp for a, b in itertools.pairwise(feedback)} == {20_000_000}
 
 
+# --- dynamic cycles ---
+
+SPEED = np.radians(60.0)
+# Zero, 90 deg, zero at 60 deg/s: the steady part of each way is 1.5 s less the two ramps.
+WAY = dataclasses.replace(
+    plan([(0, 0), (0, 90), (0, 0)]), kind=Kind.DYNAMIC, dwell=0.0, feed=SPEED
+)
+
+
+def turning(gauges: dict | None = None, **drives: float) -> tuple[np.ndarray, ...]:
+    """Times of readings, displacement in the table frame, times of feedback, positions."""
+    still = quiet(errors=dataclasses.replace(TRUTH.errors, constants={}, terms={}),
+                  runout=np.zeros(2))
+    data = dataclasses.replace(still.gauges, period=2_000_000, **(gauges or {}))
+    encoders = dataclasses.replace(still.encoders, period=2_000_000)
+    cell = Cell(dataclasses.replace(
+        still, gauges=data, encoders=encoders, drives=dataclasses.replace(still.drives, **drives)
+    ), EPOCH)
+    cell.queue(WAY)
+    blocks, feedback = run(cell)
+    mounted = [b for b in blocks if b.status.max() == Status.VALID]
+    times = np.concatenate([b.stamps for b in mounted])
+    values = np.concatenate([b.displacement for b in mounted])
+    return (
+        (times - EPOCH) * 1e-9, values @ np.linalg.inv(data.directions).T,
+        np.array([(f.stamp - EPOCH) * 1e-9 for f in feedback]),
+        np.array([f.position for f in feedback]),
+    )
+
+
+def test_a_dynamic_cycle_turns_at_its_feed_with_the_sphere_in_its_place() -> None:
+    _, seen, logged, positions = turning(acceleration=4.0)
+    speed = np.diff(positions[:, 4]) / np.diff(logged)
+    # Ramps take speed / acceleration each, and the way is 90 deg.
+    for sign in (1.0, -1.0):
+        steady = np.isclose(speed, sign * SPEED, rtol=1e-6)
+        assert steady.sum() * 0.002 == pytest.approx(1.5 - SPEED / 4.0, abs=0.01)
+    assert np.abs(np.diff(speed)).max() / 0.002 == pytest.approx(4.0, rel=1e-3)
+    np.testing.assert_allclose(seen, 0.0, atol=1e-12)
+
+
+def test_axes_trail_their_commands_by_speed_over_gain() -> None:
+    # 1/Kv of 3 ms in C and of 2 ms in X and Y: C is back by 1 ms more, the sphere is before.
+    times, seen, logged, positions = turning(linear_lag=2e-3, rotary_lag=3e-3)
+    on_time = turning()[3]
+    middle = np.abs(logged - logged[np.argmax(on_time[:, 4] > np.radians(45))]) < 0.1
+    np.testing.assert_allclose(
+        (on_time - positions)[middle, 4], 3e-3 * SPEED, rtol=1e-6
+    )
+    moving = np.interp(times, logged, on_time[:, 4])
+    rows = np.abs(moving - np.radians(45)) < np.radians(5)
+    sign = np.sign(np.gradient(moving, times))[rows]
+    # At C = 0 the sphere lies towards -Y; the table turns it towards +X.
+    np.testing.assert_allclose(seen[rows, 0], sign * 1e-3 * SPEED * 0.09, rtol=1e-3)
+    # The circle shrinks by (omega T)^2 R / 2, and turned by 1 ms of its way the sphere is nearer
+    # by the arc's own height: both towards +Y.
+    nearer = 0.5 * ((2e-3 * SPEED) ** 2 + (1e-3 * SPEED) ** 2) * 0.09
+    np.testing.assert_allclose(seen[rows, 1], nearer, rtol=1e-3)
+
+
+def test_friction_shows_in_the_readings_and_not_in_the_feedback() -> None:
+    gauges = {'friction': 3e-6, 'friction_speed': 0.045, 'friction_power': 0.5, 'late': 0.25}
+    times, seen, logged, positions = turning(gauges)
+    np.testing.assert_array_equal(positions, turning()[3])
+    where = np.interp(times - 0.25, logged, positions[:, 4])
+    speed = np.gradient(where, times)
+    rows = np.isclose(np.abs(speed), SPEED, rtol=1e-3)
+    # 0.09 m at 60 deg/s: 2.09 times the speed of the statement.
+    lag = 3e-6 * np.sqrt(0.09 * SPEED / 0.045)
+    np.testing.assert_allclose(seen[rows, 0], -np.sign(speed[rows]) * lag, rtol=1e-3)
+    np.testing.assert_allclose(seen[rows, 1:], 0.0, atol=1e-9)
+    assert rows.sum() > 500
+
+
 # --- plans the machine cannot do ---
 
 
@@ -300,7 +374,8 @@ def test_stamps_and_sequence_are_contiguous() -> None:
     [
         ({'axes': ('X', 'Y', 'Z', 'B', 'A')}, 'no axis A'),
         ({'commands': np.full((1, 5), 0.3)}, 'pose 0: X = 0.3 is outside'),
-        ({'kind': Kind.DYNAMIC}, 'does static cycles'),
+        ({'kind': Kind.DYNAMIC}, 'turns a rotary axis between all of its poses, with a feed'),
+        ({'kind': Kind.DYNAMIC, 'commands': np.zeros((2, 5))}, 'has a feed'),
     ],
 )
 def test_impossible_plans_are_refused(changes: dict, expected: str) -> None:

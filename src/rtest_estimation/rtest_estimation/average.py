@@ -15,6 +15,8 @@ OUTLIER_SIGMAS = 5.0
 # deviation (the fallback where more than half of the readings are equal, coarse resolution).
 _SIGMA_OF_MAD = 1.4826
 _SIGMA_OF_MEAN_DEVIATION = 1.2533
+# No gauge reads farther [m]; a recording may hold any number.
+MAX_READING = 1.0
 # Fewer readings than this give no covariance worth the name.
 MIN_READINGS = 3
 
@@ -43,7 +45,7 @@ class NoAverageError(ValueError):
 def average(displacement: np.ndarray, status: np.ndarray, needed: int = 3) -> Average:
     """Mean and covariance of the mean of the readings taken while nothing moved.
 
-    A gauge takes part when most of its readings are valid and finite; a reading takes part when
+    A gauge takes part when most of its readings are valid numbers; a reading takes part when
     all these gauges are valid in it and none is an outlier.
 
     Parameters
@@ -56,7 +58,7 @@ def average(displacement: np.ndarray, status: np.ndarray, needed: int = 3) -> Av
     """
     if not len(displacement):
         raise NoAverageError('no gauge readings')
-    valid = (status == Status.VALID) & np.isfinite(displacement)
+    valid = (status == Status.VALID) & (np.abs(displacement) < MAX_READING)
     gauges = np.flatnonzero(valid.mean(axis=0) > 0.5)
     if len(gauges) < needed:
         raise NoAverageError(_why_invalid(displacement, status, valid))

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from bisect import bisect_left
-
 import numpy as np
 
 from rtest_estimation.buffers import FeedbackBuffer
 from rtest_estimation.dwell import ROTARY_LETTERS, DwellRules
-from rtest_estimation.records import CyclePlan, Feedback
+from rtest_estimation.records import CyclePlan
 
 
 class CycleStart:
@@ -29,18 +27,14 @@ class CycleStart:
     def find(self, plan: CyclePlan, feedback: FeedbackBuffer) -> int | None:
         """Stamp of the first sample at any pose [ns], None before. Looks at new samples only."""
         if self._found is None:
-            first = bisect_left(feedback.stamps, max(self._seen + 1, plan.stamp))
-            for sample in feedback.samples[first:]:
-                self._seen = sample.stamp
-                if self._at_a_pose(plan, sample):
-                    self._found = sample.stamp
+            stamps, positions = feedback.since(max(self._seen + 1, plan.stamp), plan.axes)
+            known = [column for column, axis in enumerate(plan.axes) if feedback.has(axis)]
+            near = [self._near[plan.axes[column] in ROTARY_LETTERS] for column in known]
+            # Axes that the feedback does not have are taken to be there.
+            commands = plan.commands[:, known]
+            for stamp, position in zip(stamps.tolist(), positions[:, known], strict=True):
+                self._seen = stamp
+                if (np.abs(commands - position) <= near).all(axis=1).any():
+                    self._found = stamp
                     break
         return self._found
-
-    def _at_a_pose(self, plan: CyclePlan, sample: Feedback) -> bool:
-        """Axes that the feedback does not have are taken to be there."""
-        known = [(k, sample.axes.index(a)) for k, a in enumerate(plan.axes) if a in sample.axes]
-        columns = [column for column, _ in known]
-        near = [self._near[plan.axes[column] in ROTARY_LETTERS] for column in columns]
-        off = np.abs(plan.commands[:, columns] - sample.position[[of for _, of in known]])
-        return bool((off <= near).all(axis=1).any())

@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
+from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
 
-from rtest_estimation.records import CyclePlan, Missing
+from rtest_estimation.records import CyclePlan, Kind, Missing
 
 # ISO 841 letters of rotary axes, and S, the spindle angle of a plan. Only tolerances depend on it.
 ROTARY_LETTERS = frozenset('ABCS')
 # Six standard deviations of normal noise, in median absolute deviations.
 _ENDS = 6 * 1.4826
+
+
+def turns(plan: CyclePlan) -> bool:
+    """Whether it is a dynamic cycle in which a rotary axis or the spindle turns."""
+    columns = [column for column, axis in enumerate(plan.axes) if axis in ROTARY_LETTERS]
+    return plan.kind is Kind.DYNAMIC and bool(np.ptp(plan.commands[:, columns], axis=0).any())
 
 
 @dataclass(frozen=True)
@@ -89,19 +97,22 @@ def find_dwells(
     lag = max(1, round(rules.span * 1e9 / float(np.median(np.diff(stamps)))))
     runs = _standing(stamps, positions, still, gaps, lag)
     matched = _match(plan.commands, positions, runs, near)
+    approaches = _approaches(positions, still, lag)
+    shared = Counter(number for number, _ in matched.values())
+    last_run = matched[count - 1][0] if count - 1 in matched else None
+    reached = sorted(matched)
     dwells, missing = [], []
     ends = np.append(stamps, stamps[-1] if until is None else max(until, int(stamps[-1])))
     planned = round(plan.dwell * 1e9)
     for row in range(count):
         if row not in matched:
-            missing.append(Missing(row, _why_absent(row, matched, runs, ends, gaps)))
+            missing.append(Missing(row, _why_absent(row, reached, matched, runs, ends, gaps)))
             continue
         number, place = matched[row]
         first, last = runs[number]
-        rows = [r for r, (n, _) in matched.items() if n == number]
         arrived = int(stamps[first])
-        if count - 1 not in rows:
-            arrived = max(arrived, int(stamps[last]) - len(rows) * planned)
+        if number != last_run:
+            arrived = max(arrived, int(stamps[last]) - shared[number] * planned)
         arrived += place * planned
         start = arrived + int(rules.settle * 1e9)
         end = min(int(stamps[last]), arrived + planned)
@@ -113,8 +124,7 @@ def find_dwells(
         inside = slice(first, last + 1)
         used = (stamps[inside] >= start) & (stamps[inside] <= end)
         kept = positions[inside][used] if used.any() else positions[inside][-1:]
-        approach = _approach(positions[: first + 1], still, lag)
-        dwells.append(Dwell(row, start, end, kept.mean(axis=0), approach))
+        dwells.append(Dwell(row, start, end, kept.mean(axis=0), approaches[first]))
     return dwells, missing
 
 
@@ -192,29 +202,30 @@ def trailing(plan: CyclePlan) -> int:
 
 def _why_absent(
     row: int,
+    reached: list[int],
     matched: dict[int, tuple[int, int]],
     runs: list[tuple[int, int]],
     stamps: np.ndarray,
     gap: int,
 ) -> str:
     """Say whether the feedback was lost between the neighbours, or the pose was not reached."""
-    before = max((r for r in matched if r < row), default=None)
-    after = min((r for r in matched if r > row), default=None)
-    first = runs[matched[before][0]][0] if before is not None else 0
-    last = runs[matched[after][0]][1] if after is not None else len(stamps) - 1
+    place = bisect_left(reached, row)
+    first = runs[matched[reached[place - 1]][0]][0] if place else 0
+    last = runs[matched[reached[place]][0]][1] if place < len(reached) else len(stamps) - 1
     pauses = np.diff(stamps[first : last + 1])
     if len(pauses) and pauses.max() > gap:
         return f'encoder feedback stale for {pauses.max() / 1e9:.2f} s'
     return 'never reached'
 
 
-def _approach(positions: np.ndarray, still: np.ndarray, lag: int) -> np.ndarray:
-    """Sign of the last motion of every axis up to the last sample given."""
-    signs = np.zeros(positions.shape[1], dtype=np.int8)
+def _approaches(positions: np.ndarray, still: np.ndarray, lag: int) -> np.ndarray:
+    """(n, axes) int8 sign of the last motion of every axis up to each sample."""
+    signs = np.zeros(positions.shape, dtype=np.int8)
     if len(positions) <= lag:
         return signs
     steps = positions[lag:] - positions[:-lag]
     moving = np.abs(steps) > still
-    for axis in np.flatnonzero(moving.any(axis=0)):
-        signs[axis] = np.sign(steps[np.flatnonzero(moving[:, axis])[-1], axis])
+    last = np.maximum.accumulate(np.where(moving, np.arange(len(steps))[:, np.newaxis], -1))
+    known = np.take_along_axis(np.sign(steps), np.maximum(last, 0), axis=0)
+    signs[lag:] = np.where(last >= 0, known, 0.0)
     return signs

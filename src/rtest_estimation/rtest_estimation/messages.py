@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from rtest_estimation.plain_text import is_name
 from rtest_estimation.records import (
     Cycle,
     CyclePlan,
@@ -22,6 +23,9 @@ from rtest_estimation.records import (
 # A period or a channel count beyond these is a damaged message, not a gauge.
 MAX_CHANNELS = 16
 MAX_PERIOD_S = 3600.0
+# No machine goes farther, nor turns a spindle more often in a session [m, rad].
+MAX_COMMAND = 1000.0
+MAX_POSITION = 1e6
 
 
 class MessageError(ValueError):
@@ -72,6 +76,11 @@ def feedback(message: Any) -> Feedback:
         raise MessageError(
             f'JointState has {len(axes)} names and {position.size} positions, expected one each'
         )
+    if not all(map(is_name, axes)):
+        raise MessageError('JointState has names that are no letters of axes')
+    # Without a number for an axis the others still count; with a wrong one nothing does.
+    if (np.abs(position) > MAX_POSITION).any():
+        raise MessageError(f'JointState has a position of {np.nanmax(np.abs(position)):g}')
     return Feedback(nanoseconds(message.header.stamp), axes, position)
 
 
@@ -88,7 +97,9 @@ def temperature(message: Any) -> Temperature:
         )
     if not np.isfinite(value):
         raise MessageError(f'Temperature of {sensor} is {value}')
-    return Temperature(nanoseconds(message.header.stamp), sensor, value)
+    return Temperature(
+        nanoseconds(message.header.stamp), sensor, value, float(message.variance)
+    )
 
 
 def cycle_plan(message: Any) -> CyclePlan:
@@ -96,8 +107,11 @@ def cycle_plan(message: Any) -> CyclePlan:
 
     Raises MessageError where the plan cannot be measured.
     """
-    where = f'CyclePlan {message.cycle!r}'
     axes = tuple(str(axis) for axis in message.axes)
+    names = (str(message.session), str(message.cycle), str(message.setup), *axes)
+    if not all(map(is_name, (*names, message.header.frame_id))):
+        raise MessageError('CyclePlan has names that cannot be printed in a line')
+    where = f'CyclePlan {message.cycle!r}'
     commands = np.array(message.commands, dtype=float)
     if not axes or len(set(axes)) != len(axes):
         raise MessageError(f'{where}: axes are {list(axes)}, expected distinct letters')
@@ -105,8 +119,10 @@ def cycle_plan(message: Any) -> CyclePlan:
         raise MessageError(
             f'{where}: {commands.size} commands, expected poses x {len(axes)} axes'
         )
-    if not np.isfinite(commands).all():
-        raise MessageError(f'{where}: commands hold values that are not finite')
+    if not (np.abs(commands) <= MAX_COMMAND).all():
+        raise MessageError(
+            f'{where}: commands hold values that are not finite or beyond {MAX_COMMAND:g} m or rad'
+        )
     try:
         kind = Kind(int(message.kind))
     except ValueError:
@@ -117,8 +133,11 @@ def cycle_plan(message: Any) -> CyclePlan:
     if kind in (Kind.STATIC, Kind.NEST_CALIBRATION) and dwell == 0.0:
         raise MessageError(f'{where}: dwell is 0 s, a static cycle needs a time to stand still')
     sphere = np.array([message.sphere.x, message.sphere.y, message.sphere.z], dtype=float)
-    if not np.isfinite(sphere).all():
-        raise MessageError(f'{where}: the sphere position is not finite')
+    if not (np.abs(sphere) <= MAX_COMMAND).all():
+        raise MessageError(f'{where}: the sphere position is {sphere} m')
+    feed = float(message.feed)
+    if not 0.0 <= feed <= MAX_COMMAND:
+        raise MessageError(f'{where}: feed is {feed} m/s')
     return CyclePlan(
         nanoseconds(message.header.stamp),
         str(message.session),
@@ -129,7 +148,7 @@ def cycle_plan(message: Any) -> CyclePlan:
         axes,
         commands.reshape(-1, len(axes)),
         dwell,
-        float(message.feed),
+        feed,
         str(message.header.frame_id),
     )
 

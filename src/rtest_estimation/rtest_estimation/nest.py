@@ -11,6 +11,19 @@ from rtest_estimation.records import NestCalibration
 # (three gauges tilted 45 degrees) has a condition number of 1.4.
 MAX_CONDITION = 20.0
 MIN_POSITIONS = 8
+# A contact gauge shows what the sphere moves along it. What is further off is no gain of a gauge
+# but a wrong unit or decimal point, or a gauge that does not touch.
+_GAIN = (0.8, 1.25)
+# A gauge in its range that touches and is fixed follows the steps better than this share of them;
+# a ball as its tip rolls over the sphere and leaves some hundredths.
+_MISFIT = 0.1
+# What a wrong setting would make of a gain of one.
+_FACTORS = {
+    25.4: 'inch instead of mm', 1 / 25.4: 'mm instead of inch', 1000.0: 'mm instead of um',
+    0.001: 'um instead of mm', 10.0: 'one decimal too few', 0.1: 'one decimal too many',
+    100.0: 'two decimals too few', 0.01: 'two decimals too many', 2.0: 'diameter, not radius',
+    0.5: 'radius, not diameter',
+}
 
 
 class CalibrationError(ValueError):
@@ -53,11 +66,11 @@ def calibrate(
     solution, *_ = np.linalg.lstsq(design, readings, rcond=None)
     vectors, zero = solution[:3].T, solution[3]
     gain = np.linalg.norm(vectors, axis=1)
-    if not (gain > 0.1).all():
-        dead = int(np.argmin(gain)) + 1
-        raise CalibrationError(
-            f'gauge {dead} moves {gain.min():.3f} m per metre of the sphere; is it connected?'
-        )
+    for gauge, one in enumerate(gain, 1):
+        if not _GAIN[0] < one < _GAIN[1]:
+            raise CalibrationError(
+                f'gauge {gauge} moves {one:.3g} m per metre of the sphere; {_reason(one)}'
+            )
     direction = vectors / gain[:, None]
     condition = float(np.linalg.cond(direction))
     if condition > MAX_CONDITION:
@@ -65,6 +78,14 @@ def calibrate(
             f'the gauges look nearly into one plane (condition {condition:.0f}); realign the nest'
         )
     left = readings - design @ solution
+    misfit = np.sqrt((left**2).mean(axis=0))
+    worst = int(np.argmax(misfit))
+    if misfit[worst] > _MISFIT * spread[0] / np.sqrt(count):
+        raise CalibrationError(
+            f'gauge {worst + 1} does not follow the steps of the sphere, '
+            f'{misfit[worst] * 1e6:.1f} µm are left; does it touch the sphere, is it fixed, '
+            'is it in its range?'
+        )
     variance = (left**2).sum(axis=0) / (count - 4)
     cofactor = np.linalg.inv(design.T @ design)[:3, :3]
     along = np.einsum('gi,ij,gj->g', direction, cofactor, direction)
@@ -78,6 +99,14 @@ def calibrate(
         covariance=covariance, zero=zero, gain=gain,
         gain_stddev=np.sqrt(variance * along), condition=condition,
     )
+
+
+def _reason(gain: float) -> str:
+    """What may have made a gain that a gauge does not have."""
+    for factor, words in _FACTORS.items():
+        if abs(gain / factor - 1.0) < 0.03:
+            return f'is its unit right ({words})?'
+    return 'is it connected, does it touch the sphere, is its unit right?'
 
 
 def centres(nest: NestCalibration, readings: np.ndarray) -> np.ndarray:

@@ -7,14 +7,18 @@ what the node published.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
+from rtest_estimation import laser
 from rtest_estimation import nest as nests
 from rtest_estimation.average import Average, NoAverageError, average
 from rtest_estimation.buffers import FeedbackBuffer, GaugeBuffer
-from rtest_estimation.cycle_end import CycleEnd
+from rtest_estimation.columns import FeedbackColumns
+from rtest_estimation.cycle_end import CycleEnd, arrivals
 from rtest_estimation.cycle_start import CycleStart
 from rtest_estimation.dwell import ROTARY_LETTERS, Dwell, DwellRules, find_dwells
 from rtest_estimation.records import (
@@ -26,6 +30,7 @@ from rtest_estimation.records import (
     Kind,
     Missing,
     NestCalibration,
+    NestKind,
 )
 
 # Readings and feedback from before a plan arrives are kept this long: the plan travels on another
@@ -39,31 +44,43 @@ MAX_SCATTER = 20e-6
 
 @dataclass(frozen=True)
 class EstimationRules:
-    """Parameters of the estimation; sphere_radius [m] is passed on to the calibration."""
+    """Parameters of the estimation: of which kind the nest is, and its sphere_radius [m]."""
 
     dwell: DwellRules = field(default_factory=DwellRules)
     sphere_radius: float = float('nan')
+    nest: NestKind = NestKind.CONTACT
 
 
 @dataclass(frozen=True)
 class Finished:
-    """A finished cycle; after a nest calibration also its result or why there is none."""
+    """A finished cycle; after a nest calibration also its result or why there is none.
+
+    means : poses with mean readings, also where these give no sphere centre
+    """
 
     cycle: Cycle
     nest: NestCalibration | None = None
     problem: str = ''
+    means: tuple[tuple[Dwell, Average], ...] = ()
 
 
 class Estimator:
     """Collects one session's data in any interleaving and gives finished cycles.
 
+    given : nest calibrations by set-up that are used instead of the session's own
+
     Feed it with `add_plan`, `add_feedback` and `add_gauges`, then ask `finished`; `finish` closes
     what is still open at the end of a session.
     """
 
-    def __init__(self, rules: EstimationRules | None = None) -> None:
+    def __init__(
+        self,
+        rules: EstimationRules | None = None,
+        given: Mapping[str, NestCalibration] | None = None,
+    ) -> None:
         self.rules = rules or EstimationRules()
         self.nests: dict[str, NestCalibration] = {}
+        self._given = given or {}
         self._plans: list[CyclePlan] = []
         self._feedback = FeedbackBuffer()
         self._gauges = GaugeBuffer()
@@ -97,10 +114,15 @@ class Estimator:
 
     def add_feedback(self, sample: Feedback) -> None:
         """Encoder positions; a sample not newer than the one before is dropped (frozen source)."""
-        if not self._feedback.append(sample):
-            self.discarded += 1
-        elif sample.stamp - self._feedback.first > 2 * KEEP_BEFORE_NS and self._waits():
-            self._feedback.forget(sample.stamp - KEEP_BEFORE_NS)
+        stamps = np.array([sample.stamp], dtype=np.int64)
+        self.extend(FeedbackColumns(sample.axes, stamps, sample.position[None]))
+
+    def extend(self, samples: FeedbackColumns) -> None:
+        """Many samples at once; see `add_feedback`."""
+        self.discarded += self._feedback.extend(samples.axes, samples.stamps, samples.positions)
+        last = self._feedback.last
+        if last - self._feedback.first > 2 * KEEP_BEFORE_NS and self._waits():
+            self._feedback.forget(last - KEEP_BEFORE_NS)
 
     def add_gauges(self, block: GaugeBlock) -> None:
         """Gauge readings, one message's worth."""
@@ -167,20 +189,22 @@ class Estimator:
         self._reset()
         self._forget(self._plans[0].stamp if self._plans else end)
         if plan.kind is Kind.DYNAMIC:
-            reason = 'dynamic cycles are recorded but not evaluated'
-            missing = tuple(Missing(row, reason) for row in range(len(plan.commands)))
-            return Finished(Cycle(plan, (), missing, '', end), problem=reason)
+            # Its readings are evaluated one by one, not as poses.
+            came = len(arrivals(plan, positions, self.rules.dwell))
+            rest = range(came, len(plan.commands))
+            missing = tuple(Missing(row, 'never reached') for row in rest)
+            return Finished(Cycle(plan, (), missing, '', end))
         dwells, missing = find_dwells(plan, stamps, positions, self.rules.dwell, end)
         data = (times, displacement, status)
         if plan.kind is Kind.NEST_CALIBRATION:
             return self._calibrate(plan, dwells, missing, data, end)
-        nest = self.nests.get(plan.setup)
+        nest = self._given.get(plan.setup) or self.nests.get(plan.setup)
         if nest is None:
             problem = f'no nest calibration of set-up {plan.setup}'
             everything = tuple(Missing(row, problem) for row in range(len(plan.commands)))
             return Finished(Cycle(plan, (), everything, '', end), problem=problem)
-        points, missing = _points(plan, nest, dwells, missing, data)
-        return Finished(Cycle(plan, points, missing, nest.calibration, end))
+        points, missing, means = _points(plan, nest, dwells, missing, data)
+        return Finished(Cycle(plan, points, missing, nest.calibration, end), means=means)
 
     def _calibrate(
         self,
@@ -190,7 +214,7 @@ class Estimator:
         data: tuple[np.ndarray, np.ndarray, np.ndarray],
         end: int,
     ) -> Finished:
-        """Eq. 2-5 on the dwells whose gauges were all valid."""
+        """Eq. 2-5, of lasers Eq. 5-3, on the dwells whose gauges were all valid."""
         positions, readings, lost = [], [], list(missing)
         linear = [c for c, axis in enumerate(plan.axes) if axis not in ROTARY_LETTERS]
         if [plan.axes[c] for c in linear] != ['X', 'Y', 'Z']:
@@ -209,8 +233,9 @@ class Estimator:
             problem = f'no pose of {plan.cycle} has valid readings'
             return Finished(Cycle(plan, (), tuple(lost), '', end), problem=problem)
         steps = np.array(positions) - plan.commands[0, linear]
+        calibrate = laser.calibrate if self.rules.nest is NestKind.LASER else nests.calibrate
         try:
-            nest = nests.calibrate(
+            nest = calibrate(
                 steps, np.array(readings), f'{plan.session}/{plan.cycle}', plan.setup, end,
                 self.rules.sphere_radius,
             )
@@ -218,8 +243,9 @@ class Estimator:
             lost.sort(key=lambda m: m.index)
             return Finished(Cycle(plan, (), tuple(lost), '', end), problem=str(error))
         self.nests[plan.setup] = nest
-        points, lost_points = _points(plan, nest, dwells, missing, data)
-        return Finished(Cycle(plan, points, lost_points, nest.calibration, end), nest)
+        points, lost_points, means = _points(plan, nest, dwells, missing, data)
+        cycle = Cycle(plan, points, lost_points, nest.calibration, end)
+        return Finished(cycle, nest, means=means)
 
     def _forget(self, before: int) -> None:
         self._feedback.forget(before)
@@ -245,9 +271,15 @@ def _points(
     dwells: list[Dwell],
     missing: list[Missing],
     data: tuple[np.ndarray, np.ndarray, np.ndarray],
-) -> tuple[tuple[CyclePoint, ...], tuple[Missing, ...]]:
-    """Sphere centres of the dwells, relative to the first of them (initial reset, Eq. 3-2)."""
-    points, lost = [], list(missing)
+) -> tuple[
+    tuple[CyclePoint, ...], tuple[Missing, ...], tuple[tuple[Dwell, Average], ...]
+]:
+    """Sphere centres of the dwells, relative to the first of them (initial reset, Eq. 3-2).
+
+    Also the poses that have none, and the mean readings of those that have some.
+    """
+    points, lost, means = [], list(missing), []
+    needed, locate = _locator(nest)
     for dwell in dwells:
         try:
             if data[1].shape[1] and data[1].shape[1] != len(nest.direction):
@@ -255,11 +287,12 @@ def _points(
                     f'{data[1].shape[1]} gauges, the nest was calibrated with '
                     f'{len(nest.direction)}'
                 )
-            mean = _mean(dwell, data, 3)
+            mean = _mean(dwell, data, needed)
+            means.append((dwell, mean))
+            position, covariance, disagreement = locate(mean)
         except NoAverageError as error:
             lost.append(Missing(dwell.index, str(error)))
             continue
-        position, covariance, disagreement = nests.centre(nest, mean)
         points.append(
             CyclePoint(
                 dwell.index, (dwell.start + dwell.end) // 2, dwell.feedback, dwell.approach,
@@ -269,4 +302,14 @@ def _points(
     if points:
         reset = points[0].displacement
         points = [replace(p, displacement=p.displacement - reset) for p in points]
-    return tuple(points), tuple(sorted(lost, key=lambda m: m.index))
+    return tuple(points), tuple(sorted(lost, key=lambda m: m.index)), tuple(means)
+
+
+def _locator(
+    nest: NestCalibration,
+) -> tuple[int, Callable[[Average], tuple[np.ndarray, np.ndarray, float]]]:
+    """How many gauges a sphere centre needs, and what finds it from their mean readings."""
+    if nest.kind is NestKind.LASER:
+        # The correction belongs to all the lasers together.
+        return len(nest.direction), laser.CentreSolver(nest).centre
+    return 3, partial(nests.centre, nest)

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -13,10 +12,11 @@ import numpy as np
 
 from rtest_estimation import messages
 from rtest_estimation.bagfile import Bag, read_bag
+from rtest_estimation.columns import GaugeColumns, Stream
 from rtest_estimation.errors import UserError
 from rtest_estimation.message_reader import DamagedMessage
 from rtest_estimation.records import CyclePlan, Feedback, GaugeBlock, Temperature
-from rtest_estimation.sequence import SequenceCheck
+from rtest_estimation.sequence import Loss, SequenceCheck
 
 # What a recording is read for: message type and the name the graph gives the topic.
 ROLES = {
@@ -29,7 +29,11 @@ ROLES = {
     'location_errors': ('rtest_msgs/msg/LocationErrors', 'rtest/location_errors'),
 }
 TEMPERATURE = 'sensor_msgs/msg/Temperature'
-TYPES = frozenset((*(message_type for message_type, _ in ROLES.values()), TEMPERATURE))
+TYPES = frozenset((
+    TEMPERATURE,
+    # Readings and feedback may be too many to be kept; see `columns`.
+    *(kind for role, (kind, _) in ROLES.items() if role not in ('gauges', 'feedback')),
+))
 NEEDED = {
     'gauges': 'gauge readings',
     'feedback': 'encoder feedback',
@@ -37,8 +41,10 @@ NEEDED = {
 }
 # Gaps that a warning lists one by one.
 LISTED_GAPS = 5
+# A session has a few cycles at each of a few sphere positions.
+MAX_PLANS = 10_000
 
-Stamped = TypeVar('Stamped', GaugeBlock, Feedback, CyclePlan, Temperature)
+Stamped = TypeVar('Stamped', CyclePlan, Temperature)
 
 
 @dataclass(frozen=True)
@@ -46,7 +52,7 @@ class Recording:
     """One recorded session.
 
     machine_text : YAML of the machine, None where it was not recorded
-    plans, gauges, feedback : in the order of their stamps
+    plans, gauges, feedback : in the order of their stamps; gauges and feedback stay in the file
     nests, cycles, location_errors : messages that were published during the session, if any
     warnings : everything that is missing or damaged, one sentence each
     topics : name to (type, number of messages), of everything in the file
@@ -59,8 +65,8 @@ class Recording:
     session: str
     machine_text: str | None
     plans: tuple[CyclePlan, ...]
-    gauges: tuple[GaugeBlock, ...]
-    feedback: tuple[Feedback, ...]
+    gauges: Stream[GaugeBlock]
+    feedback: Stream[Feedback]
     nests: tuple[Any, ...]
     cycles: tuple[Any, ...]
     location_errors: tuple[Any, ...]
@@ -88,15 +94,8 @@ def recording_of(bag: Bag, topics: Mapping[str, str] | None = None) -> Recording
     """The session in a bag that was read with `TYPES`; see `read_recording`."""
     warnings = list(bag.warnings)
     chosen = _find_topics(bag, topics)
-    arrived = _convert(bag, chosen['gauges'], messages.gauge_block, warnings)
-    lost = _check_sequence(arrived, chosen['gauges'], bag.start, warnings)
-    gauges = _in_order(arrived, chosen['gauges'], bag.start, warnings)
-    feedback = _in_order(
-        _convert(bag, chosen['feedback'], messages.feedback, warnings),
-        chosen['feedback'],
-        bag.start,
-        warnings,
-    )
+    gauges, lost = _gauges(bag, chosen['gauges'], warnings)
+    feedback = _feedback(bag, chosen['feedback'], warnings)
     plans = _plans(_convert(bag, chosen['plan'], messages.cycle_plan, warnings), warnings)
     for role, records in (('gauges', gauges), ('feedback', feedback), ('plan', plans)):
         if not records:
@@ -241,18 +240,24 @@ def _raw_messages(bag: Bag, topic: str | None, warnings: list[str]) -> tuple[Any
     return good
 
 
-def _check_sequence(
-    blocks: Iterable[GaugeBlock], topic: str, start: int, warnings: list[str]
-) -> int:
-    """Count lost readings and name them in a warning."""
+def _gauges(bag: Bag, topic: str, warnings: list[str]) -> tuple[Stream[GaugeBlock], int]:
+    """Readings, and how many are lost; gaps are named in a warning."""
     check = SequenceCheck()
-    gaps = [
-        loss
-        for block in blocks
-        if (loss := check.add(block.stamp, block.sequence, len(block.displacement)))
-    ]
+    gaps: list[Loss] = []
+
+    def look(columns: GaugeColumns) -> None:
+        readings = columns.displacement.shape[1]
+        numbers = zip(columns.stamps.tolist(), columns.sequence.tolist(), strict=True)
+        for stamp, sequence in numbers:
+            if (loss := check.add(stamp, sequence, readings)) is not None:
+                gaps.append(loss)
+
+    stream = Stream(bag, topic, look)
+    _note_left_out(stream, topic, warnings)
     if gaps:
-        listed = [f'{gap.count} before {_seconds(gap.stamp, start)}' for gap in gaps[:LISTED_GAPS]]
+        listed = [
+            f'{gap.count} before {_seconds(gap.stamp, bag.start)}' for gap in gaps[:LISTED_GAPS]
+        ]
         more = f' and {len(gaps) - LISTED_GAPS} more' if len(gaps) > LISTED_GAPS else ''
         warnings.append(
             f'{topic}: {_plural(check.lost, "reading")} lost in {_plural(len(gaps), "gap")} '
@@ -260,29 +265,42 @@ def _check_sequence(
         )
     if check.restarts:
         warnings.append(f'{topic}: the driver was restarted {_plural(check.restarts, "time")}')
-    return check.lost
+    _note_steps(stream, topic, bag.start, warnings)
+    return stream, check.lost
 
 
-def _in_order(
-    records: list[Stamped], topic: str, start: int, warnings: list[str]
-) -> tuple[Stamped, ...]:
-    """Sort by stamp; stamps that step back are named in a warning."""
-    back = [record for before, record in pairwise(records) if record.stamp < before.stamp]
-    if not back:
-        return tuple(records)
-    warnings.append(
-        f'{topic}: stamps step back {_plural(len(back), "time")}, first to '
-        f'{_seconds(back[0].stamp, start)}; sorted'
-    )
-    return tuple(sorted(records, key=lambda record: record.stamp))
+def _feedback(bag: Bag, topic: str, warnings: list[str]) -> Stream[Feedback]:
+    stream = Stream(bag, topic)
+    _note_left_out(stream, topic, warnings)
+    _note_steps(stream, topic, bag.start, warnings)
+    return stream
+
+
+def _note_left_out(stream: Stream, topic: str, warnings: list[str]) -> None:
+    if stream.damaged:
+        warnings.append(
+            f'{topic}: {_plural(stream.damaged, "message")} left out ({stream.left_out})'
+        )
+
+
+def _note_steps(stream: Stream, topic: str, start: int, warnings: list[str]) -> None:
+    if stream.back:
+        warnings.append(
+            f'{topic}: stamps step back {_plural(len(stream.back), "time")}, first to '
+            f'{_seconds(stream.back[0], start)}; sorted'
+        )
 
 
 def _plans(arrived: list[CyclePlan], warnings: list[str]) -> tuple[CyclePlan, ...]:
     """Plans by stamp; one that was delivered twice (latched topic) counts once."""
     unique = {(plan.session, plan.cycle, plan.stamp): plan for plan in arrived}
+    if len(unique) > MAX_PLANS:
+        raise UserError(f'{len(unique)} plans in one recording, expected {MAX_PLANS} at most')
     sessions = sorted({plan.session for plan in arrived})
     if len(sessions) > 1:
-        warnings.append(f'plans of several sessions in one recording: {", ".join(sessions)}')
+        listed = ', '.join(sessions[:LISTED_GAPS])
+        more = f' and {len(sessions) - LISTED_GAPS} more' if len(sessions) > LISTED_GAPS else ''
+        warnings.append(f'plans of several sessions in one recording: {listed}{more}')
     return tuple(sorted(unique.values(), key=lambda plan: plan.stamp))
 
 

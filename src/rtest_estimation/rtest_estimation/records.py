@@ -46,6 +46,7 @@ class GaugeBlock:
     period : time between readings [s]; 0 when there is one reading
     displacement : (n, channels) float64 [m], positive along the gauge direction
     status : (n, channels) uint8, see `Status`
+    times : (n,) int64 [ns] of a block that is made of several messages; None for a single one
     """
 
     stamp: int
@@ -53,10 +54,13 @@ class GaugeBlock:
     period: float
     displacement: np.ndarray
     status: np.ndarray
+    times: np.ndarray | None = None
 
     @property
     def stamps(self) -> np.ndarray:
         """(n,) int64 acquisition time of every reading [ns]."""
+        if self.times is not None:
+            return self.times
         steps = np.arange(len(self.displacement)) * (self.period * 1e9)
         return self.stamp + np.rint(steps).astype(np.int64)
 
@@ -75,11 +79,15 @@ class Feedback:
 
 @dataclass(frozen=True)
 class Temperature:
-    """Reading of a thermometer. stamp : [ns]; sensor : its name; value : [deg C]."""
+    """Reading of a thermometer.
+
+    stamp : [ns]; sensor : its name; value : [deg C]; variance : [K2], 0 where it is not known
+    """
 
     stamp: int
     sensor: str
     value: float
+    variance: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -186,3 +194,12 @@ class NestCalibration:
     spot: np.ndarray = field(default_factory=lambda: np.empty((0, 3)))
     correction_nodes: np.ndarray = field(default_factory=lambda: np.empty((0, 3)))
     correction_values: np.ndarray = field(default_factory=lambda: np.empty((0, 3)))
+
+    @property
+    def sensitive(self) -> np.ndarray:
+        """(gauges, 3) unit vectors along which a small motion of the sphere is read.
+
+        Of a laser the surface normal at its spot: the beam's own direction shows in the curvature
+        of the sphere alone and is known to degrees only.
+        """
+        return self.spot / self.sphere_radius if self.kind is NestKind.LASER else self.direction

@@ -14,6 +14,7 @@ from rtest_estimation.laser.correction import (
     Kernel,
     compare,
     leave_one_out,
+    local_scatter,
 )
 from rtest_estimation.laser.verification import verification_positions, verify
 
@@ -137,3 +138,17 @@ def test_verification_counts_and_deviations_by_hand():
     assert found.count(CentreStatus.OUTSIDE) == 1
     nothing = verify(solver, commanded, np.full((3, 3), np.nan))
     assert nothing.raw is None and nothing.count(CentreStatus.NO_SIGNAL) == 3
+
+
+def test_local_scatter_is_the_noise_and_not_the_smooth_error():
+    at = nodes()
+    found = []
+    for seed in range(40):
+        noise = 6e-7 * np.random.default_rng(seed).normal(size=at.shape)
+        scatter, freedom = local_scatter(at, saddle(at) + noise)
+        found.append(scatter**2)
+    # 27 nodes less 10 terms of the second degree, three components.
+    assert freedom == 51
+    assert np.sqrt(np.mean(found)) == pytest.approx(6e-7, rel=0.05)
+    assert np.isnan(local_scatter(at[:10], saddle(at[:10]))[0])
+    assert local_scatter(at[:10], saddle(at[:10]))[1] == 0

@@ -48,6 +48,15 @@ def test_area_2_ends_where_a_known_error_exceeds_the_tolerance():
     assert wide.accurate == pytest.approx(4e-4 * np.sqrt(2), abs=1e-5)
 
 
+def test_the_top_is_found_from_next_to_zero():
+    # The highest reading lies at zero but for rounding, the top does not.
+    place = scan()
+    place[np.abs(place) < 1e-12] = 1e-19
+    bump = 1e-6 * np.exp(-((place**2).sum(axis=1)) / (2e-5) ** 2)
+    found = measure_profile(place, sphere(place) + bump, everywhere(place), R)
+    np.testing.assert_allclose(found.top, TOP, atol=2e-7)
+
+
 def test_noise_level_is_the_noise():
     place = scan(points=601)
     noise = 8e-7 * np.random.default_rng(1).normal(size=len(place))

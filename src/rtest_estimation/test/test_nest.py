@@ -110,3 +110,27 @@ def test_covariance_of_a_centre_matches_monte_carlo():
 def test_a_useless_calibration_is_refused(positions, readings, words):
     with pytest.raises(CalibrationError, match=words):
         calibrate(positions, readings, 'id', '1a', 0)
+
+
+@pytest.mark.parametrize(
+    ('factor', 'words'),
+    [
+        (25.4, 'gauge 2 moves 25.4 m per metre of the sphere; is its unit right .inch instead'),
+        (1e-3, 'um instead of mm'), (0.1, 'one decimal too many'), (0.0, 'is it connected'),
+        (1.3, 'does it touch'),
+    ],
+)
+def test_a_wrong_unit_of_one_gauge_is_refused(factor, words):
+    positions, readings = made()
+    readings[:, 1] *= factor
+    with pytest.raises(CalibrationError, match=words):
+        calibrate(positions, readings, 'id', '1a', 0)
+
+
+def test_a_gauge_that_does_not_follow_is_refused():
+    positions, readings = made(noise=3e-7)
+    # At its stop: half of the range is not shown.
+    readings[:, 2] = np.maximum(readings[:, 2], 0.0)
+    with pytest.raises(CalibrationError, match='gauge 3 .*(does not follow|moves)'):
+        calibrate(positions, readings, 'id', '1a', 0)
+    calibrate(*made(noise=2e-6), 'id', '1a', 0)

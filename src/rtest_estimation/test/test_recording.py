@@ -224,7 +224,7 @@ def test_damaged_chunk_is_left_out_and_the_rest_is_read(tmp_path):
     assert before + 70 < after
     bag.path.write_bytes(data)
     recording = read_recording(bag.path)
-    assert any('damaged chunks left out: 1' in warning for warning in recording.warnings)
+    assert any('chunks or records left out: 1' in warning for warning in recording.warnings)
     missing = second['/rtest/gauges'] - first['/rtest/gauges']
     assert len(recording.gauges) == 20 - missing
     assert recording.lost == 10 * missing
@@ -477,7 +477,7 @@ def test_huge_lengths_ask_for_no_memory(tmp_path):
     data[place + 25 : place + 33] = (2**50).to_bytes(8, 'little')
     bag.path.write_bytes(data)
     recording = read_recording(bag.path)
-    assert any('damaged chunks left out: 1' in text for text in recording.warnings)
+    assert any('damaged chunks or records left out: 1' in text for text in recording.warnings)
     assert len(recording.gauges) == 18
 
 

@@ -245,10 +245,13 @@ class ErrorField:
                 f'{name} = {np.degrees(positions[row, self.machine.letters.index(name)]):.6g}'
                 for name in self.rotary
             )
-            ranges = '; '.join(nodes.span for nodes in (self.outer, self.inner) if nodes)
+            here = positions[row : row + 1]
+            ranges = {text: None for nodes in (self.outer, self.inner) if nodes
+                      for text in nodes.left(self.machine.letters, here)}
+            pose = f'pose {row} ({angles} deg)' if len(positions) > 1 else f'{angles} deg'
             raise UserError(
-                f'pose {row} ({angles} deg) is outside the measured stations of {ranges}: measure '
-                'there too'
+                f'{pose} is outside the measured stations of {", ".join(ranges)}: measure there '
+                'too'
             )
         return inside, readings
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -73,10 +74,10 @@ class AxisNodes:
         columns = np.array([p.column for p in data.parameters])
         return cls(data.axis, columns, data.value, Stations.of(data.stations), place)
 
-    @property
-    def span(self) -> str:
-        """For example `B (-75 to 75 deg)`."""
-        return _span(self.axis, self.stations)
+    def left(self, letters: Sequence[str], position: np.ndarray) -> list[str]:
+        """Axes whose stations a position (1, k) leaves, for example `B (-75 to 75 deg)`."""
+        inside = self.stations.place(position[:, self.place])[1].all()
+        return [] if inside else [_span(letters[self.place], self.stations)]
 
     def read(self, positions: np.ndarray) -> Reading:
         """Interpolate at positions (n, k) [rad]."""
@@ -141,11 +142,14 @@ class GridNodes:
             (places[0], places[1]),
         )
 
-    @property
-    def span(self) -> str:
-        """For example `C (the whole turn)`."""
-        narrow = [s for s, _ in self.rows if not s.periodic] or [self.rows[0][0]]
-        return _span(self.axis, narrow[0])
+    def left(self, letters: Sequence[str], position: np.ndarray) -> list[str]:
+        """Axes whose stations a position (1, k) leaves, for example `B (-75 to 75 deg)`."""
+        outer, inner = self.places
+        # Any level whose stations of the inner axis do not hold it narrows that axis.
+        every = [(outer, self.levels), *((inner, stations) for stations, _ in self.rows)]
+        found = [_span(letters[place], stations) for place, stations in every
+                 if not stations.place(position[:, place])[1].all()]
+        return list(dict.fromkeys(found))
 
     def read(self, positions: np.ndarray) -> Reading:
         """Interpolate at positions (n, k) [rad]: along the inner axis, then along the outer."""

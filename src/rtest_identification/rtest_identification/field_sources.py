@@ -60,8 +60,7 @@ def outer_cross(result: Identification) -> np.ndarray:
     first, second = result.location.gain, result.fit.error_map.gain
     both = np.concatenate([first, second])
     sources = sum(result.sources.carry(both).values())
-    noise = result.fit.rms**2 * np.einsum('pni,qni->pq', first, second)
-    return noise + sources[: len(first), len(first) :]
+    return result.fit.across + sources[: len(first), len(first) :]
 
 
 def grid_covariance(result: Identification) -> np.ndarray:
@@ -112,7 +111,7 @@ def from_file(path: Path | str, machine: Machine, every_map: bool) -> Sources:
         raise UserError(f'{path}: cannot read the identification: {error}') from None
     try:
         return _from_data(data, machine, every_map)
-    except (KeyError, TypeError, ValueError) as error:
+    except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
         raise UserError(
             f'{path}: not an identification.json of the machine {machine.name!r}: '
             f'{type(error).__name__}: {error}'
@@ -124,10 +123,15 @@ def _from_data(data: dict[str, Any], machine: Machine, every_map: bool) -> Sourc
     symbols = [p.symbol for p in parameters]
     if data['uncertainty']['symbols'] != symbols:
         raise ValueError(f'its errors are {", ".join(data["uncertainty"]["symbols"])}')
-    known = {**data['location_errors'], **data['squareness']}
-    value = np.array([known[s]['value'] if s in known else 0.0 for s in symbols])
+    given = {**data['location_errors'], **data['squareness']}
+    known = {p.symbol: _value(p, given[p.symbol]) for p in parameters
+             if given.get(p.symbol) and given[p.symbol]['value'] is not None}
+    value = np.array([known.get(s, 0.0) for s in symbols])
     covariance = _array(data['uncertainty']['covariance'])
+    _check_variance(covariance, 'uncertainty')
     outer = inner = None
+    if not isinstance(data['error_maps'], dict):
+        raise ValueError('error_maps: expected maps by axis, {} where there is none')
     for axis, given in data['error_maps'].items():
         if not every_map and not _stands_out(given['significance']):
             continue
@@ -139,15 +143,34 @@ def _from_data(data: dict[str, Any], machine: Machine, every_map: bool) -> Sourc
             size = (len(symbols), values.size)
             own = _array(given.get('covariance', np.diag(stddev.ravel() ** 2)))
             across = _array(given.get('covariance_with_location_errors', np.zeros(size)))
+            if not np.isfinite(values).all():
+                raise ValueError(f'error_maps of {axis}: expected finite numbers')
+            _check_variance(own, f'error_maps of {axis}')
             covariance = np.block([[covariance, across], [across.T, own]])
         else:
             diagonal = np.moveaxis(stddev, 0, -1)[..., None] ** 2 * np.eye(6)
             own = _array(given.get('covariance', diagonal))
+            _check_variance(own, f'error_maps of {axis}')
             inner = InnerMap(
                 axis, errors, _array(given['b_rad']), _array(given['c_rad']), values, own
             )
     lost = tuple(s for s in symbols if s not in known)
     return Sources(parameters, value, covariance, outer, inner, lost)
+
+
+def _value(p: ErrorParameter, given: dict[str, Any]) -> float:
+    value, unit = given['value'], given.get('unit', p.unit)
+    if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
+        raise ValueError(f'{p.symbol}: value {value!r}, expected a finite number of {p.unit}')
+    if unit != p.unit:
+        raise ValueError(f'{p.symbol}: unit {unit!r}, expected {p.unit!r}')
+    return float(value)
+
+
+def _check_variance(covariance: np.ndarray, what: str) -> None:
+    """Refuse negative variances in (..., n, n)."""
+    if (np.einsum('...ii->...i', covariance) < 0.0).any():
+        raise ValueError(f'{what}: a variance in covariance is negative')
 
 
 def _array(values: Any) -> np.ndarray:

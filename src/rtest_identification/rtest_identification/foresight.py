@@ -13,13 +13,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from rtest_estimation.errors import UserError
-from rtest_estimation.records import CyclePlan, Kind
+from rtest_estimation.records import CyclePlan
 from rtest_identification.error_map import coupled, stations, zero_mean
 from rtest_identification.grid_map import fit_grid
 from rtest_identification.least_squares import solve
 from rtest_identification.machine import Machine
 from rtest_identification.moves import AxisPath
-from rtest_identification.observations import Observations
+from rtest_identification.observations import Observations, turns
 from rtest_identification.signatures import signatures
 from rtest_identification.symbols import (
     ErrorParameter,
@@ -129,7 +129,7 @@ def planned(
     for plan, path in zip(plans, paths, strict=True):
         at_pose = start + path.arrival + np.arange(len(plan.commands)) * plan.dwell
         start = float(at_pose[-1]) + plan.dwell
-        if plan.kind is Kind.STATIC:
+        if turns(machine, plan):
             chosen.append(plan)
             stamps.append(np.rint(at_pose * 1e9).astype(np.int64))
             signs.append(path.signs()[:, :letters])

@@ -128,7 +128,7 @@ def linear_positions(machine: Machine, sphere: np.ndarray, positions: np.ndarray
 
     Parameters
     ----------
-    sphere : (3,) nominal sphere centre, frame ``table`` [m]
+    sphere : (3,) or (n, 3) nominal sphere centre, frame ``table`` [m]
     positions : (n, k) in the order of ``machine.letters``; the linear axes' values are ignored
 
     Returns

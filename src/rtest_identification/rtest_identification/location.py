@@ -78,6 +78,8 @@ class Fit:
     rms_location : the same with the location errors alone
     outliers : rows of the observations that were left out
     joint : whether the location errors were fitted together with the map
+    across : (p, 6 s) covariance of the location errors with the map, zero where they were not
+        fitted together; None without a map
     inner_map : of the inner rotary axis, from what all this leaves; None where it has too few
         stations or the spheres determine nothing of it beyond noise
     joint_inner : whether everything was fitted together with the inner map
@@ -90,6 +92,7 @@ class Fit:
     rms_location: float
     outliers: np.ndarray
     joint: bool
+    across: np.ndarray | None = None
     inner_map: GridMap | None = None
     joint_inner: bool = False
 
@@ -243,15 +246,19 @@ def _with_map(
     rms = weights.typical * float(np.sqrt(unit))
     joint = significance < MAP_SIGNIFICANCE
     location = alone.location
+    # Without the map the constants take what it is orthogonal to.
+    across = np.zeros((len(location.value), len(covariance)))
     if joint:
         carry = solve(a, b, scale_a).value
         total = unit * (shift.cofactor + carry @ second.cofactor @ carry.T)
+        across = -(carry @ (unit * second.cofactor) @ turn.T)[: len(location.value)]
         moved = location.value + shift.value[: len(location.value)]
         gain = shift.inverse - carry @ free_inverse
         location = _location(
             location.parameters, moved, shift, total, freedom, weights.gain(gain)
         )
-    return Fit(location, error_map, residual, rms, alone.rms, alone.outliers, joint), effect
+    found = Fit(location, error_map, residual, rms, alone.rms, alone.outliers, joint, across)
+    return found, effect
 
 
 def _location(
@@ -274,7 +281,8 @@ class _Whitening:
 
     def __init__(self, covariance: np.ndarray, rms: float) -> None:
         readings = float(np.trace(covariance, axis1=1, axis2=2).mean()) / 3.0
-        dwell = max(rms**2 - readings, 0.1 * rms**2)
+        # Of few readings the scatter is singular, and of a single pose there is no residual.
+        dwell = max(rms**2 - readings, 0.1 * rms**2, 1e-9 * readings)
         if rms == 0.0:
             covariance, dwell = np.zeros_like(covariance), 1.0
         total = covariance + dwell * np.eye(3)

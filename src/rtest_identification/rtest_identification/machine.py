@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import math
+import reprlib
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from rtest_estimation.errors import UserError
+from rtest_estimation.plain_text import is_name
+from rtest_estimation.yaml_text import load_yaml
 
 BED = 'bed'
+MAX_AXES = 12
 _KEYS = {'name', 'chain', 'axes', 'tool_mm'}
 _AXIS_KEYS = {
     'linear': {'type', 'direction', 'range_mm'},
@@ -102,22 +105,23 @@ def parse_machine(text: str, where: str = 'machine') -> Machine:
 
     Raises UserError naming key and what is expected.
     """
-    try:
-        data = yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        raise UserError(f'{where}: not valid YAML: {" ".join(str(error).split())}') from None
+    data = load_yaml(text, where)
     if not isinstance(data, dict):
         raise UserError(f'{where}: expected a mapping with name, chain and axes')
     _only(data, _KEYS, where)
     axes_data = data.get('axes')
     if not isinstance(axes_data, dict) or not axes_data:
         raise UserError(f'{where}: axes: expected a mapping of axis letters')
+    if len(axes_data) > MAX_AXES or not all(is_name(str(name)) for name in axes_data):
+        raise UserError(f'{where}: axes: expected {MAX_AXES} at most, and letters for their names')
+    if not is_name(str(data.get('name', ''))):
+        raise UserError(f'{where}: name: expected one that can be printed in a line')
     axes = {str(name): _axis(str(name), spec, where) for name, spec in axes_data.items()}
     chain = data.get('chain')
     if not isinstance(chain, list) or sorted(map(str, chain)) != sorted([*axes, BED]):
         raise UserError(
             f'{where}: chain: expected {BED!r} and every axis of axes once, '
-            f'from the table to the tool, got {chain}'
+            f'from the table to the tool, got {reprlib.repr(chain)}'
         )
     tool = _vector(data.get('tool_mm', [0, 0, 0]), f'{where}: tool_mm') * 1e-3
     machine = Machine(str(data.get('name', '')), tuple(map(str, chain)), axes, tool, text)
@@ -133,7 +137,7 @@ def _axis(name: str, spec: Any, where: str) -> Axis:
         raise UserError(f'{where}: expected a mapping with type and direction')
     kind = spec.get('type')
     if not isinstance(kind, str) or kind not in _AXIS_KEYS:
-        raise UserError(f"{where}: type: expected 'linear' or 'rotary', got {kind!r}")
+        raise UserError(f"{where}: type: expected 'linear' or 'rotary', got {reprlib.repr(kind)}")
     _only(spec, _AXIS_KEYS[kind], where)
     direction = _vector(spec.get('direction'), f'{where}: direction')
     length = float(np.linalg.norm(direction))
@@ -141,11 +145,11 @@ def _axis(name: str, spec: Any, where: str) -> Axis:
         raise UserError(f'{where}: direction: expected a unit vector, got length {length:.6g}')
     sense = spec.get('sense', 1)
     if sense not in (1, -1) or isinstance(sense, bool):
-        raise UserError(f'{where}: sense: expected 1 or -1, got {sense!r}')
+        raise UserError(f'{where}: sense: expected 1 or -1, got {reprlib.repr(sense)}')
     key, scale = ('range_deg', math.pi / 180) if kind == 'rotary' else ('range_mm', 1e-3)
     limits = spec.get(key, [-math.inf, math.inf])
     if not (isinstance(limits, list) and len(limits) == 2 and all(map(_number, limits))):
-        raise UserError(f'{where}: {key}: expected [lower, upper], got {limits!r}')
+        raise UserError(f'{where}: {key}: expected [lower, upper], got {reprlib.repr(limits)}')
     if not limits[0] < limits[1]:
         raise UserError(f'{where}: {key}: the lower end {limits[0]} is not below {limits[1]}')
     return Axis(
@@ -160,11 +164,12 @@ def _number(value: Any) -> bool:
 def _vector(value: Any, where: str) -> np.ndarray:
     good = isinstance(value, list) and len(value) == 3 and all(map(_number, value))
     if not good or not all(map(math.isfinite, value)):
-        raise UserError(f'{where}: expected three numbers, got {value!r}')
+        raise UserError(f'{where}: expected three numbers, got {reprlib.repr(value)}')
     return np.array(value, dtype=float)
 
 
 def _only(data: dict, known: set[str], where: str) -> None:
     for key in data:
         if key not in known:
-            raise UserError(f'{where}: unknown key {key!r}, expected one of {sorted(known)}')
+            found = reprlib.repr(key)
+            raise UserError(f'{where}: unknown key {found}, expected one of {sorted(known)}')

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from rtest_estimation.dwell import turns
 from rtest_estimation.errors import UserError
 from rtest_estimation.records import CyclePlan
 from rtest_identification.kinematics import linear_positions, predict
@@ -14,8 +15,13 @@ from rtest_identification.machine import Machine
 
 # How far the sphere may be from its place in the nest while the axes move [m].
 ARC_TOLERANCE = 5e-5
+# The same in a dynamic cycle, where blocks are not too short for it [m].
+_DYNAMIC_TOLERANCE = 1e-6
 # Shortest time of a piece [s]: controllers take no shorter block.
 _SHORTEST = 0.02
+# One of a dynamic cycle turns by this at most: at the ends and middles of full turns the sphere
+# looks as if it never left its place [rad].
+_PIECE = math.radians(60.0)
 
 
 @dataclass(frozen=True)
@@ -85,9 +91,13 @@ def synchronous_path(
     The rotary axes go straight to their ends and the linear ones so that the sphere goes straight,
     as seen from the table, from one nominal place to the next, which is the same one in a static
     cycle. There are as many pieces as it takes to keep the sphere within `tolerance` [m] of that.
-    Each takes as long as its slowest axis.
+    Each takes as long as its slowest axis; in a dynamic cycle, as its rotary axis at the feed, and
+    no shorter than the feed allows where only linear axes move.
     """
-    speeds = speeds or Speeds()
+    speeds, fewest, most = speeds or Speeds(), 1, math.inf
+    turning = turns(plan)
+    if turning:
+        speeds, tolerance = Speeds(math.inf, plan.feed), min(tolerance, _DYNAMIC_TOLERANCE)
     count = len(machine.letters)
     if plan.axes[:count] != machine.letters:
         raise UserError(
@@ -98,13 +108,20 @@ def synchronous_path(
     rows, poses = [plan.commands[:1]], [np.zeros(1, dtype=int)]
     for number in range(1, len(plan.commands)):
         pair = slice(number - 1, number + 1)
-        pieces = _pieces(machine, plan.commands[pair], spheres[pair], tolerance)
+        if turning:
+            travel = np.abs(np.diff(plan.commands[pair], axis=0)).max()
+            fewest = math.ceil(travel / _PIECE)
+            most = max(fewest, math.floor(travel / (plan.feed * _SHORTEST)))
+        pieces = _pieces(machine, plan.commands[pair], spheres[pair], tolerance, fewest, most)
         rows.append(pieces)
         poses.append(np.r_[np.full(len(pieces) - 1, -1), number])
     positions = np.vstack(rows)
     rotary = [machine.axes[name].rotary if name in machine.axes else True for name in plan.axes]
     limit = np.where(rotary, speeds.rotary, speeds.linear)
-    time = np.maximum((np.abs(np.diff(positions, axis=0)) / limit).max(axis=1), _SHORTEST)
+    steps = np.diff(positions, axis=0)
+    time = np.maximum((np.abs(steps) / limit).max(axis=1), _SHORTEST)
+    if plan.feed > 0.0 and not turning:
+        time = np.maximum(time, np.linalg.norm(steps, axis=1) / plan.feed)
     return AxisPath(positions, np.concatenate(poses), np.r_[0.0, time])
 
 
@@ -144,11 +161,11 @@ def deviation(machine: Machine, ends: np.ndarray) -> np.ndarray:
 
 
 def _pieces(
-    machine: Machine, ends: np.ndarray, spheres: np.ndarray, tolerance: float
+    machine: Machine, ends: np.ndarray, spheres: np.ndarray, tolerance: float, fewest: int,
+    most: float,
 ) -> np.ndarray:
-    """Ends of the pieces of one move, without its start."""
-    letters = len(machine.letters)
-    count = 1
+    """Ends of the pieces of one move, without its start, and how many there may be."""
+    letters, count = len(machine.letters), fewest
     while True:
         share = np.linspace(0.0, 1.0, count + 1)[:, None]
         rows = ends[0] + share * (ends[1] - ends[0])
@@ -156,7 +173,7 @@ def _pieces(
             place = spheres[0] + share * (spheres[1] - spheres[0])
             rows[1:-1, :letters] = linear_positions(machine, place, rows[:, :letters])[1:-1]
         worst = float(deviation(machine, rows[:, :letters]).max())
-        if worst <= tolerance:
+        if worst <= tolerance or count >= most:
             return rows[1:]
         # The sagitta of a piece goes with the square of its length.
-        count = max(count + 1, math.ceil(count * math.sqrt(worst / tolerance)))
+        count = min(max(count + 1, math.ceil(count * math.sqrt(worst / tolerance))), most)

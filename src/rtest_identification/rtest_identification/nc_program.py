@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+from rtest_estimation.dwell import turns
 from rtest_estimation.errors import UserError
 from rtest_estimation.records import CyclePlan
 from rtest_identification.kinematics import predict
@@ -27,7 +28,7 @@ from rtest_identification.machine import Machine
 from rtest_identification.moves import ARC_TOLERANCE, Approach, AxisPath, clear_of_nest
 from rtest_identification.nc_controllers import CONTROLLERS
 from rtest_identification.plan_check import duration
-from rtest_identification.plans import SPINDLE
+from rtest_identification.plans import DYNAMIC_REST, SPINDLE
 
 # 0.1 um and 1e-5 deg: the latter moves the sphere by 0.02 um at 100 mm.
 LINEAR_DIGITS, ROTARY_DIGITS = 4, 5
@@ -86,7 +87,9 @@ def nc_program(
             f'{", ".join(machine.linear)}'
         )
     turned = [machine.letters.index(name) for name in machine.rotary]
-    if settings.tcp and np.abs(plan.commands[[0, -1]][:, turned]).max(initial=0.0) > 1e-9:
+    # A full turn from zero the table is where it is at zero.
+    ends = np.sin(0.5 * plan.commands[[0, -1]][:, turned])
+    if settings.tcp and np.abs(ends).max(initial=0.0) > 1e-9:
         raise UserError(f'{plan.cycle}: in TCP mode a cycle must start and end with rotary axes 0')
     writer = _Writer(machine, plan.axes)
     lines = ['%', *([f'O{number:04d}'] if settings.controller == 'iso' else [])]
@@ -134,7 +137,7 @@ def _header(
     sphere_radius: float | None,
 ) -> list[str]:
     controller = CONTROLLERS[settings.controller]
-    minutes = duration(plan, path, approach) / 60.0
+    minutes, dwell = duration(plan, path, approach) / 60.0, plan.dwell or DYNAMIC_REST
     x, y, z = np.asarray(plan.sphere) * 1e3
     at_zero = machine.tool * 1e3
     said = [
@@ -143,7 +146,7 @@ def _header(
         f'MACHINE {machine.name}, CONTROLLER {controller.name}, MM AND DEG',
         f'SETUP {plan.setup}: SPHERE CENTRE AT X{x:.3f} Y{y:.3f} Z{z:.3f} OF THE TABLE FRAME'
         + (f', RADIUS {sphere_radius * 1e3:.4f}' if sphere_radius else ''),
-        f'{len(plan.commands)} POSES, DWELL {plan.dwell:g} S, ABOUT {minutes:.0f} MIN'
+        f'{len(plan.commands)} POSES, DWELL {dwell:g} S, ABOUT {minutes:.0f} MIN'
         + (' WITHOUT THE STOPS' if settings.pause else ''),
     ]
     said += [_axis(machine, name) for name in machine.letters]
@@ -241,7 +244,9 @@ def _poses(
                 lines.append(f'M19 R{round(angle, 3) % 360.0:.3f}')
             # No message: LinuxCNC keeps some twenty for a screen to fetch, and where there is none
             # each further one holds the program, and what it tells of itself, for 5 s.
-            lines += [f'(POSE {pose})', controller.dwell(plan.dwell)]
+            lines.append(f'(POSE {pose})')
+            if rest := plan.dwell or (DYNAMIC_REST if turns(plan) else 0.0):
+                lines.append(controller.dwell(rest))
             if settings.pause:
                 lines.append('M0')
     return lines

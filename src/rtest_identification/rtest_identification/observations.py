@@ -8,7 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rtest_estimation.errors import UserError
-from rtest_estimation.records import Cycle, Kind
+from rtest_estimation.laser.correction import local_scatter
+from rtest_estimation.records import Cycle, CyclePlan, Kind, NestCalibration, NestKind
 from rtest_identification.kinematics import predict
 from rtest_identification.machine import Machine
 
@@ -69,12 +70,26 @@ class Observations:
         return result.centre - self.sphere, result.jacobian
 
 
+def turns(machine: Machine, plan: CyclePlan) -> bool:
+    """Whether a cycle is a static one in which a rotary axis moves.
+
+    Otherwise it says nothing of them: it verifies the nest.
+    """
+    columns = [plan.axes.index(name) for name in machine.rotary if name in plan.axes]
+    return plan.kind is Kind.STATIC and bool(np.ptp(plan.commands[:, columns], axis=0).any())
+
+
 def stack(machine: Machine, cycles: Sequence[Cycle]) -> Observations:
-    """Stack the points of all static cycles.
+    """Stack the points of all static cycles in which a rotary axis moves.
 
     Raises UserError where a cycle's axes are not the machine's, or nothing was measured.
     """
-    static = [cycle for cycle in cycles if cycle.plan.kind is Kind.STATIC and cycle.points]
+    static = [cycle for cycle in cycles if turns(machine, cycle.plan) and cycle.points]
+    if not static and any(cycle.plan.kind is Kind.DYNAMIC for cycle in cycles):
+        raise UserError(
+            'no static cycle with a valid point in this session; `rtest dynamic` evaluates its '
+            'dynamic cycles'
+        )
     if not static:
         raise UserError(
             'no static cycle with a valid point in this session; '
@@ -109,13 +124,24 @@ def stack(machine: Machine, cycles: Sequence[Cycle]) -> Observations:
     )
 
 
-def repeatability(cycles: Sequence[Cycle]) -> tuple[float, int]:
+def repeatability(
+    cycles: Sequence[Cycle], nests: Sequence[NestCalibration] = ()
+) -> tuple[float, int]:
     """What the same pose gives again: standard deviation per component [m], degrees of freedom.
 
     From the nest calibrations, in which the sphere moves by known steps at B = C = 0 with several
     visits to each position: scatter about the means of equal commands. It needs no model of the
     machine, so that a misfit of the model can be judged by it.
+
+    A laser that comes back to a place reads the same speckle again, but not where the sphere has
+    turned: of laser nests among `nests` it is the scatter of their corrections.
     """
+    lasers = [nest for nest in nests if nest.kind is NestKind.LASER]
+    if lasers:
+        found = [local_scatter(n.correction_nodes, n.correction_values) for n in lasers]
+        freedom = sum(number for _, number in found)
+        squares = sum(one**2 * number for one, number in found if number)
+        return (float(np.sqrt(squares / freedom)), freedom) if freedom else (float('nan'), 0)
     squares, freedom = 0.0, 0
     for cycle in cycles:
         if cycle.plan.kind is not Kind.NEST_CALIBRATION or not cycle.calibration:

@@ -11,16 +11,19 @@ import numpy as np
 
 from rtest_estimation.attempts import counted
 from rtest_estimation.bagfile import Bag, read_bag
+from rtest_estimation.dwell import ROTARY_LETTERS
 from rtest_estimation.errors import UserError
 from rtest_estimation.missing import grouped
 from rtest_estimation.pipeline import EstimationRules, Estimator, Finished
 from rtest_estimation.recording import (
     TYPES,
     Recording,
+    read_recording,
     recorded_machine,
     recording_of,
     temperatures,
 )
+from rtest_estimation.records import CyclePlan, Kind, NestCalibration, NestKind
 from rtest_identification.gap.effects import Effect, library
 from rtest_identification.gap.model_file import Model, load_model
 from rtest_identification.gap.scene import Scene
@@ -32,25 +35,36 @@ from rtest_identification.pipeline import Identification, identify
 from rtest_identification.tolerance import Tolerances
 from rtest_identification.uncertainty import load_priors
 
+# Commands nearer than this are the same place [m].
+SAME_PLACE = 1e-9
+
 
 def estimate_recording(
     recording: Recording,
     rules: EstimationRules | None = None,
     progress: Callable[[str], None] = lambda line: None,
+    nests: Mapping[str, NestCalibration] | None = None,
 ) -> list[Finished]:
     """Every cycle of a recording, as the estimator node finished them.
 
     Of a cycle that was measured more than once the attempt that counts.
+
+    rules : those of the node, as far as the recording says, where they are not given
+    nests : calibrations by set-up that are used instead of the recording's own
     """
-    estimator = Estimator(rules)
+    estimator = Estimator(rules or rules_of(recording), nests)
     done: list[Finished] = []
 
     def note(ready: Finished) -> None:
+        if ready.nest is not None and nests:
+            ready = replace(ready, nest=nests.get(ready.nest.setup, ready.nest))
         done.append(ready)
         cycle = ready.cycle
+        poses = f'{len(cycle.points)} of {len(cycle.plan.commands)} poses'
+        if cycle.plan.kind is Kind.DYNAMIC:
+            poses = 'read while the axes move'
         progress(
-            f'{cycle.plan.cycle}: {len(cycle.points)} of {len(cycle.plan.commands)} poses'
-            + (f' ({ready.problem})' if ready.problem else '')
+            f'{cycle.plan.cycle}: {poses}' + (f' ({ready.problem})' if ready.problem else '')
         )
 
     for plan in recording.plans:
@@ -63,6 +77,46 @@ def estimate_recording(
         note(ready)
     kept = {id(cycle) for cycle in counted(one.cycle for one in done)}
     return [one for one in done if id(one.cycle) in kept]
+
+
+def rules_of(recording: Recording) -> EstimationRules:
+    """Kind and sphere of the nest, as the recorded calibrations say.
+
+    Where none was recorded: lasers are calibrated in a cube, contact gauges along single axes.
+    """
+    rules = EstimationRules()
+    for message in reversed(recording.nests):
+        if message.kind in tuple(NestKind):
+            return replace(
+                rules, nest=NestKind(message.kind), sphere_radius=float(message.sphere_radius)
+            )
+    if any(_through_cube(plan) for plan in recording.plans):
+        rules = replace(rules, nest=NestKind.LASER)
+    return rules
+
+
+def _through_cube(plan: CyclePlan) -> bool:
+    """Whether a nest calibration moves all its linear axes at once."""
+    moved = np.abs(plan.commands - plan.commands[0]) > SAME_PLACE
+    linear = [axis not in ROTARY_LETTERS for axis in plan.axes]
+    return plan.kind is Kind.NEST_CALIBRATION and bool(moved[:, linear].all(axis=1).any())
+
+
+def nests_of(path: Path | str, plans: Sequence[CyclePlan]) -> dict[str, NestCalibration]:
+    """Nest calibrations of a recording by set-up.
+
+    plans : of the session that they are for; raises UserError where a set-up of them is missing
+    """
+    finished = estimate_recording(read_recording(path))
+    nests = {one.nest.setup: one.nest for one in finished if one.nest is not None}
+    for plan in plans:
+        if plan.setup not in nests:
+            there = ', '.join(nests) or 'none'
+            raise UserError(
+                f'{path}: no nest calibration of set-up {plan.setup}, there is {there}; give a '
+                'recording that has them all'
+            )
+    return nests
 
 
 def lost_cycles(finished: Iterable[Finished]) -> list[str]:
@@ -101,6 +155,7 @@ def identify_recording(
     model_path: Path | str | None = None,
     tolerances: Tolerances | None = None,
     effects_path: Path | str | None = None,
+    nest_path: Path | str | None = None,
 ) -> Identification:
     """Identify the machine from a recording alone.
 
@@ -112,6 +167,7 @@ def identify_recording(
     model_path : file of a model whose effects are free besides
     tolerances : by which the machine is to be judged afterwards
     effects_path : file of the user's own effects that the model has
+    nest_path : another recording, whose nest calibrations are used
 
     Raises UserError naming file and what is expected.
     """
@@ -129,13 +185,15 @@ def identify_recording(
     if tolerances:
         tolerances.check(machine)
     recording = recording_of(bag, topics)
-    finished = estimate_recording(recording, None, progress)
-    directions = {f.nest.setup: f.nest.direction for f in finished if f.nest is not None}
+    given = nests_of(nest_path, recording.plans) if nest_path is not None else None
+    finished = estimate_recording(recording, None, progress, given)
+    nests = [f.nest for f in finished if f.nest is not None]
+    directions = {nest.setup: nest.sensitive for nest in nests}
     effects = None
     if model:
         effects = _effects_of(model, more, recording.plans[0].stamp, directions)
     try:
-        result = identify(machine, [f.cycle for f in finished], priors, effects)
+        result = identify(machine, [f.cycle for f in finished], priors, effects, nests)
     except UserError as error:
         why = '; '.join(lost_cycles(finished))
         raise UserError(f'{path}: {error}' + (f' ({why})' if why else '')) from None
@@ -168,7 +226,7 @@ def _effects_of(
 def _in_order(
     estimator: Estimator, recording: Recording
 ) -> Iterator[tuple[int, Callable[..., None], object]]:
-    """Feedback and gauge blocks merged by acquisition time."""
-    feedback = ((r.stamp, estimator.add_feedback, r) for r in recording.feedback)
-    gauges = ((r.stamp, estimator.add_gauges, r) for r in recording.gauges)
+    """Feedback and readings, a second at a time, merged by acquisition time."""
+    feedback = ((int(p.stamps[0]), estimator.extend, p) for p in recording.feedback.pieces())
+    gauges = ((p.stamp, estimator.add_gauges, p) for p in recording.gauges.pieces())
     return heapq.merge(feedback, gauges, key=lambda item: item[0])

@@ -10,12 +10,12 @@ from scipy import stats
 
 from rtest_estimation import runout as runouts
 from rtest_estimation.errors import UserError
-from rtest_estimation.records import Cycle, Kind
+from rtest_estimation.records import Cycle, Kind, NestCalibration
 from rtest_identification.error_map import AxisMap
 from rtest_identification.grid_map import GridMap
 from rtest_identification.location import MAP_SIGNIFICANCE, Effects, Estimate, Fit, fit
 from rtest_identification.machine import Machine
-from rtest_identification.observations import Observations, repeatability, stack
+from rtest_identification.observations import Observations, repeatability, stack, turns
 from rtest_identification.symbols import ErrorParameter
 from rtest_identification.uncertainty import AxisPrior, Budget, Sources, budget
 
@@ -86,11 +86,13 @@ def identify(
     cycles: Sequence[Cycle],
     priors: dict[str, AxisPrior] | None = None,
     effects: Effects | None = None,
+    nests: Sequence[NestCalibration] = (),
 ) -> Identification:
     """Identify a machine from the finished cycles of one session.
 
     priors : what is known of the error motions of the linear axes, by letter
     effects : of a model that are free besides
+    nests : calibrations of the session; the scatter of laser nests is in them
 
     Raises UserError where there is nothing to identify from.
     """
@@ -113,7 +115,7 @@ def identify(
     result = fit(observations, effects)
     known = np.where(result.location.determined, result.location.value, np.nan)
     refuse_other_machine(machine, result.location.parameters, known, result.rms)
-    noise, freedom = repeatability(cycles)
+    noise, freedom = repeatability(cycles, nests)
     errors = np.zeros((len(machine.letters), 6))
     errors.flat[[p.column for p in result.location.parameters]] = result.location.value
     used = observations.keep(np.setdiff1d(np.arange(len(observations)), result.outliers))
@@ -139,7 +141,7 @@ def identify(
     return Identification(
         session, machine, observations, result, noise, freedom, runout, shares, sources, outliers,
         missing, tuple(warnings), tuple(notes) + _about_priors(priors), _disagreement(cycles),
-        poses=sum(len(c.plan.commands) for c in cycles if c.plan.kind is Kind.STATIC),
+        poses=sum(len(c.plan.commands) for c in cycles if turns(machine, c.plan)),
     )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,28 +17,37 @@ from rtest_identification.foresight import NOISE, Expected, ExpectedMap, Foresig
 from rtest_identification.moves import AxisPath, synchronous_path
 from rtest_identification.nc_program import NcSettings, nc_program
 from rtest_identification.plan_check import NOT_CHECKED, PlanCheck, check_plan
-from rtest_identification.session_file import SessionConfig
+from rtest_identification.plans import program_name
+from rtest_identification.session_file import DYNAMIC, PACE, SessionConfig
 
 COVERAGE_FACTOR = 2.0
 
 
 @dataclass(frozen=True)
 class CheckedPlan:
-    """A session's cycles with their moves, checked, and what they will determine."""
+    """A session's cycles with their moves, checked, and what they will determine.
+
+    paths, checks : of every distinct cycle; a repeated one is there once, and foreseen once
+    foresight : of the static cycles; None where there is none
+    """
 
     config: SessionConfig
     paths: tuple[AxisPath, ...]
     checks: tuple[PlanCheck, ...]
-    foresight: Foresight
+    foresight: Foresight | None
 
     @property
     def duration(self) -> float:
         """Of all cycles [s], without mounting."""
-        return sum(check.duration for check in self.checks)
+        waiting = (self.config.repetitions - 1) * self.config.every
+        return sum(check.duration for check in self.checks) + waiting
 
     @property
     def warnings(self) -> tuple[str, ...]:
         """What somebody should know before measuring."""
+        checks = tuple(text for check in self.checks for text in check.warnings)
+        if self.foresight is None:
+            return checks
         location = self.foresight.location
         lost = [p.symbol for p, good in zip(location.parameters, location.determined, strict=True)
                 if not good]
@@ -49,7 +58,13 @@ class CheckedPlan:
                     f'map of {one.axis}: these spheres do not tell {", ".join(one.undetermined)} '
                     'from each other at every pose'
                 )
-        return (*found, *(text for check in self.checks for text in check.warnings))
+        every = self.config.every
+        if every and self.checks[-1].duration > every:
+            found.append(
+                f'a cycle takes {self.checks[-1].duration / 60.0:.1f} min and is to be repeated '
+                f'every {every / 60.0:g} min: the cycles will be late'
+            )
+        return (*found, *checks)
 
     @property
     def unchecked(self) -> str:
@@ -68,13 +83,16 @@ def check_session(
     """
     machine = config.machine
     paths = tuple(
-        synchronous_path(machine, plan, config.speeds, settings.chord) for plan in config.plans
+        synchronous_path(machine, plan, config.speeds, settings.chord) for plan in config.distinct
     )
     checks = tuple(
         check_plan(machine, plan, path, config.approach, config.table, config.spindle)
-        for plan, path in zip(config.plans, paths, strict=True)
+        for plan, path in zip(config.distinct, paths, strict=True)
     )
-    return CheckedPlan(config, paths, checks, foresee(machine, config.plans, paths, noise))
+    foresight = None
+    if config.kind != DYNAMIC:
+        foresight = foresee(machine, config.distinct, paths, noise)
+    return CheckedPlan(config, paths, checks, foresight)
 
 
 def write_plan(
@@ -95,20 +113,22 @@ def write_plan(
         variants['nc_tcp'] = NcSettings(**{**vars(settings), 'tcp': True})
     files: dict[str, str] = {}
     cycles, number = [], 1
-    for plan, path, check in zip(config.plans, checked.paths, checked.checks, strict=True):
-        entry = _cycle(plan, check)
-        entry['poses_file'] = f'{plan.cycle}.csv'
+    for plan, path, check in zip(config.distinct, checked.paths, checked.checks, strict=True):
+        name = program_name(plan.cycle)
+        entry = _cycle(replace(plan, cycle=name), check)
+        entry['poses_file'] = f'{name}.csv'
         files[entry['poses_file']] = _poses(config, plan, path)
         for key, variant in variants.items():
             end = '.nc' if variant.controller == 'iso' else '.ngc'
-            entry[key] = f'{plan.cycle}{"-tcp" if variant.tcp else ""}{end}'
+            entry[key] = f'{name}{"-tcp" if variant.tcp else ""}{end}'
             files[entry[key]] = nc_program(
-                config.machine, plan, path, config.approach, variant, session,
+                config.machine, replace(plan, cycle=name), path, config.approach, variant, session,
                 config.sphere_radius, number,
             )
             number += 1
         cycles.append(entry)
-    files['error_motions.csv'] = _error_motions(checked.foresight)
+    if checked.foresight is not None:
+        files['error_motions.csv'] = _error_motions(checked.foresight)
     files['machine.yaml'] = config.machine.text
     files['session.yaml'] = _session(config)
     data = _as_dict(checked, session) | {'cycles': cycles}
@@ -166,10 +186,15 @@ def _error_motions(seen: Foresight) -> str:
 
 def _session(config: SessionConfig) -> str:
     """The session file with the cycle as it was planned, beside its machine file."""
-    cycle = dict(config.data.get('cycle', {})) | {'kind': config.kind}
-    for name, stations in zip(config.machine.rotary, config.stations, strict=True):
-        cycle[f'{name.lower()}_deg'] = [round(v, 9) + 0.0 for v in np.degrees(stations).tolist()]
-    data = config.data | {'machine': 'machine.yaml', 'cycle': cycle}
+    data = config.data | {'machine': 'machine.yaml'}
+    if config.kind != DYNAMIC:
+        cycle = dict(config.data.get('cycle', {})) | {'kind': config.kind}
+        for name, stations in zip(config.machine.rotary, config.stations, strict=True):
+            degrees = np.degrees(stations).tolist()
+            cycle[f'{name.lower()}_deg'] = [round(v, 9) + 0.0 for v in degrees]
+        if not config.every:
+            cycle = {key: value for key, value in cycle.items() if key not in PACE}
+        data['cycle'] = cycle
     if config.devices:
         # Their files stay where they are.
         data['devices'] = {
@@ -182,17 +207,25 @@ def _session(config: SessionConfig) -> str:
 
 def _as_dict(checked: CheckedPlan, session: str) -> dict[str, Any]:
     config, seen = checked.config, checked.foresight
-    rotary = [p.axis in config.machine.rotary for p in seen.location.parameters]
-    maps = [m for m in (seen.outer_map, seen.inner_map) if m is not None]
-    return {
+    common = {
         'session': session,
         'machine': config.machine.name,
         'kind': config.kind,
+        'repeated': {'every': config.every, 'cycles': config.repetitions}
+        if config.every else None,
+        'duration': checked.duration,
+        'not_checked': checked.unchecked,
+        'warnings': list(checked.warnings),
+    }
+    if seen is None:
+        return common
+    rotary = [p.axis in config.machine.rotary for p in seen.location.parameters]
+    maps = [m for m in (seen.outer_map, seen.inner_map) if m is not None]
+    return common | {
         'stations': {
             name: values.tolist()
             for name, values in zip(config.machine.rotary, config.stations, strict=True)
         },
-        'duration': checked.duration,
         'noise': seen.noise,
         'coverage_factor': COVERAGE_FACTOR,
         'poses': seen.poses,
@@ -207,8 +240,6 @@ def _as_dict(checked: CheckedPlan, session: str) -> dict[str, Any]:
             }
             for o in seen.outlooks
         ],
-        'not_checked': checked.unchecked,
-        'warnings': list(checked.warnings),
     }
 
 

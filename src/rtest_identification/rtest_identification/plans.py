@@ -1,14 +1,17 @@
-"""Measurement cycles: what the machine is commanded to do (sections 2.2.2, 3.3 and 3.7.1)."""
+"""What the machine is commanded to do in a cycle (sections 2.2.2, 3.3, 3.7.1 and 5.7.2)."""
 
 from __future__ import annotations
 
 import math
+import re
+from dataclasses import replace
 from itertools import cycle, islice
 from typing import Any
 
 import numpy as np
 
 from rtest_estimation.errors import UserError
+from rtest_estimation.laser.verification import cube, verification_positions
 from rtest_estimation.records import CyclePlan, Kind
 from rtest_identification.kinematics import linear_positions
 from rtest_identification.machine import Machine
@@ -25,6 +28,10 @@ UNEVEN_DEG = (0, 50, 60, 80, 110, 145, 160, 200, 240, 270, 315, 335)
 # How far an outermost level is overrun before it is approached from outside: more than any
 # backlash and enough to be a pose of its own, less than what counts as another station [rad].
 OVERRUN = math.radians(0.05)
+_REPEATED = re.compile(r'(.*-thermal)-\d+')
+# A dynamic cycle rests so long where it turns round: the readings have settled, and the end of the
+# cycle is seen by half of it [s].
+DYNAMIC_REST = 1.0
 
 
 def nest_calibration(
@@ -41,6 +48,67 @@ def nest_calibration(
             offset = step * np.eye(len(start))[machine.letters.index(name)]
             rows += [start, start + offset, start - offset]
     return _plan(machine, Kind.NEST_CALIBRATION, setup, 'nest', sphere, [*rows, start], dwell)
+
+
+def laser_calibration(
+    machine: Machine, setup: str, sphere: np.ndarray, edge: float = 1e-3, dwell: float = 0.3
+) -> CyclePlan:
+    """The 27 points of a cube (section 5.4.3), its middle also first and last; rotaries at 0.
+
+    edge, sphere in m, dwell in s.
+    """
+    commands = _stepped(machine, sphere, cube(edge, (3, 3, 3)))
+    return _plan(machine, Kind.NEST_CALIBRATION, setup, 'nest', sphere, commands, dwell)
+
+
+def laser_verification(
+    machine: Machine, setup: str, sphere: np.ndarray, edge: float = 1e-3, dwell: float = 0.2
+) -> CyclePlan:
+    """The 1,183 points of section 5.6.3, the middle of their cube also first and last.
+
+    A static cycle in which no rotary axis moves: `observations.stack` leaves it out.
+    """
+    commands = _stepped(machine, sphere, verification_positions(edge))
+    return _plan(machine, Kind.STATIC, setup, 'verification', sphere, commands, dwell)
+
+
+def laser_scan(
+    machine: Machine,
+    setup: str,
+    sphere: np.ndarray,
+    number: int,
+    direction: np.ndarray,
+    half: float,
+    pitch: float,
+    feed: float,
+) -> CyclePlan:
+    """Lines over the top of the sphere, across the beam of one laser (section 5.3.3-(2)).
+
+    number : of the laser, from 1
+    direction : (3,) unit vector from the sphere to the laser, frame ``table`` at B = C = 0
+    half : half the length of the lines and half the width of all [m]; pitch : between them [m]
+    feed : [m/s]
+    """
+    level = np.cross(direction, [0.0, 0.0, 1.0])
+    # Along the plane of the optics of a laser that stands level; of a vertical one along X.
+    along = level / np.linalg.norm(level) if np.linalg.norm(level) > 1e-3 else np.eye(3)[0]
+    across = np.cross(direction, along)
+    lines = np.linspace(-half, half, 2 * round(half / pitch) + 1)
+    ends = [
+        sign * half * along + line * across
+        for row, line in enumerate(lines)
+        for sign in ((-1, 1) if row % 2 == 0 else (1, -1))
+    ]
+    commands = _stepped(machine, sphere, np.array(ends))
+    return _plan(
+        machine, Kind.DYNAMIC, setup, f'scan-{number}', sphere, commands, 0.0, feed
+    )
+
+
+def _stepped(machine: Machine, sphere: np.ndarray, offsets: np.ndarray) -> np.ndarray:
+    """(n + 2, axes) rotaries at 0, the sphere at its nominal place, off it by (n, 3) [m], back."""
+    places = np.asarray(sphere, dtype=float) + np.vstack([np.zeros(3), offsets, np.zeros(3)])
+    return linear_positions(machine, places, np.zeros((len(places), len(machine.letters))))
 
 
 def spindle_runout(
@@ -76,6 +144,24 @@ def static(
     poses = [(0.0, 0.0), *_sweep(outer, inner), (0.0, 0.0)]
     commands = linear_positions(machine, sphere, _rotary(machine, poses))
     return _plan(machine, Kind.STATIC, setup, 'static', sphere, commands, dwell)
+
+
+def thermal(static_cycle: CyclePlan, count: int) -> list[CyclePlan]:
+    """A static cycle again and again while the machine warms up (section 4.3).
+
+    They are named SETUP-thermal-01 and so on.
+    """
+    digits = max(2, len(str(count)))
+    return [
+        replace(static_cycle, cycle=f'{static_cycle.setup}-thermal-{number:0{digits}}')
+        for number in range(1, count + 1)
+    ]
+
+
+def program_name(cycle: str) -> str:
+    """Name of the NC program of a cycle: repeated ones share theirs."""
+    repeated = _REPEATED.fullmatch(cycle)
+    return repeated[1] if repeated else cycle
 
 
 def diagnostic(
@@ -131,6 +217,25 @@ def check(
     return _plan(machine, Kind.STATIC, setup, 'check', sphere, commands, dwell)
 
 
+def dynamic(
+    machine: Machine, setup: str, sphere: np.ndarray, axis: str, speed: float, turns: float
+) -> CyclePlan:
+    """One rotary axis to and fro at a constant speed, the linear axes following (section 5.7.2).
+
+    speed : [rad/s]; turns : each way, from zero upwards where the range allows it, else as far on
+        both sides of zero
+    """
+    travel = 2.0 * math.pi * turns
+    start = 0.0 if travel <= machine.axes[axis].upper + 1e-9 else -0.5 * travel
+    rows = np.zeros((3, len(machine.letters)))
+    rows[:, machine.letters.index(axis)] = start, start + travel, start
+    # The path speed of a motion that a rotary axis leads, for a person in deg/min.
+    name = f'dynamic-{math.degrees(speed) * 60.0:.0f}'
+    commands = linear_positions(machine, sphere, rows)
+    plan = _plan(machine, Kind.DYNAMIC, setup, name, sphere, commands, 0.0)
+    return replace(plan, feed=speed)
+
+
 def _sweep(outer: np.ndarray, inner: np.ndarray) -> list[tuple[float, float]]:
     """Every level of the outer axis in turn, the inner axis to and fro."""
     return [
@@ -158,10 +263,11 @@ def _plan(
     sphere: np.ndarray,
     commands: Any,
     dwell: float,
+    feed: float = 0.0,
 ) -> CyclePlan:
     return CyclePlan(
         0, '', f'{setup}-{suffix}', kind, setup, np.asarray(sphere, dtype=float),
-        machine.letters, np.array(commands, dtype=float), dwell,
+        machine.letters, np.array(commands, dtype=float), dwell, feed,
     )
 
 

@@ -10,11 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
-from rtest_estimation.dwell import DwellRules
 from rtest_estimation.errors import UserError
-from rtest_estimation.records import CyclePlan, Kind
+from rtest_estimation.records import CyclePlan, Kind, NestKind
+from rtest_estimation.yaml_text import read_yaml
 from rtest_identification.machine import Axis, Machine, load_machine
 from rtest_identification.moves import Approach, Speeds
 from rtest_identification.plan_check import Spindle, Table
@@ -23,31 +22,38 @@ from rtest_identification.plans import (
     check,
     check_ranges,
     diagnostic,
-    nest_calibration,
+    dynamic,
+    program_name,
     spindle_runout,
     static,
+    thermal,
 )
+from rtest_identification.session_nest import DWELL_S, calibration_plan, laser_checks, nest_kind
 from rtest_identification.session_reader import Reader
 
-STATIC, DIAGNOSTIC, CHECK = 'static', 'diagnostic', 'check'
+STATIC, DIAGNOSTIC, THERMAL, DYNAMIC = 'static', 'diagnostic', 'thermal', 'dynamic'
+CHECK = 'check'
 # Fewer do not tell offset, sine and cosine of an error over the axis from each other.
 FEWEST_STATIONS = 3
 # Closer ones are one pose for the machine and for who looks for its stops.
 CLOSEST_DEG = 0.1
-# What can be meant: half of a dwell at least is used; steps that the gauges see and reach.
-_DWELL_S = (2.0 * DwellRules().settle, 60.0)
-_STEP_MM = (0.05, 5.0)
 _RADIUS_MM = (1.0, 100.0)
 # Six points tell a circle from noise.
 _RUNOUT_STATIONS = (6, 360)
+# Less of a turn than this shows no harmonics; nobody waits for more.
+_TURNS = (0.25, 100.0)
 _NAME = re.compile(r'[A-Za-z0-9][A-Za-z0-9._-]*')
-_BUILD = {STATIC: static, DIAGNOSTIC: diagnostic, CHECK: check}
+_BUILD = {STATIC: static, DIAGNOSTIC: diagnostic, THERMAL: static, CHECK: check}
+# Of a thermal session: between the starts of its cycles, and from the first to the last of them.
+_EVERY_MIN, _HOURS = (0.1, 24.0 * 60.0), (0.01, 24.0 * 14.0)
+_MOST_CYCLES = 2000
+PACE = ('every_min', 'hours')
 _KEYS = {
-    'machine', 'sphere_radius_mm', 'cycle', 'nest_calibration', 'spindle_runout', 'setups',
-    'moves', 'table', 'spindle', 'devices',
+    'machine', 'sphere_radius_mm', 'cycle', 'dynamic', 'nest_calibration', 'spindle_runout',
+    'setups', 'moves', 'table', 'spindle', 'devices', 'nest', 'verification', 'scan',
 }
 # The drivers that a session can start; what their backends are is the drivers' affair.
-_DRIVERS = ('gauges', 'cnc')
+_DRIVERS = ('gauges', 'cnc', 'thermometers')
 # Who starts the NC programs: a person, or the session; the latter goes on after their first stop
 # (M0) where that is wanted.
 BY_HAND, STARTED, UNATTENDED = 'by hand', 'started', 'unattended'
@@ -71,17 +77,22 @@ class SessionConfig:
     """What is to be measured in a session.
 
     sphere_radius : [m]
+    nest : of contact gauges or of lasers
     plans : in order, each with stamp 0 and an empty session name until it is started
-    kind : of the cycle, 'static', 'diagnostic' or 'check'
-    stations : of each rotary axis [rad], outer one first
+    kind : of the cycle, 'static', 'diagnostic', 'thermal' or 'check'; 'dynamic' where there are
+        dynamic ones only
+    stations : of each rotary axis [rad], outer one first; none where there is no static cycle
     speeds, approach : how the axes move between poses, and to the first pose
     table, spindle : bodies that must not touch; None where the file says nothing of them
-    devices : of the drivers 'gauges' and 'cnc'; a driver that is not in it is started elsewhere
+    devices : of the drivers 'gauges', 'cnc' and 'thermometers'; a driver that is not in it is
+        started elsewhere
     data : the mapping that was read
+    every : from start to start of the cycles of a thermal session [s]; 0 for other sessions
     """
 
     machine: Machine
     sphere_radius: float
+    nest: NestKind
     plans: tuple[CyclePlan, ...]
     kind: str
     stations: tuple[np.ndarray, ...]
@@ -91,6 +102,22 @@ class SessionConfig:
     spindle: Spindle | None
     devices: dict[str, Device]
     data: dict[str, Any]
+    every: float = 0.0
+
+    @property
+    def distinct(self) -> tuple[CyclePlan, ...]:
+        """The plans, of a repeated cycle the first."""
+        named = {program_name(plan.cycle): plan for plan in reversed(self.plans)}
+        return tuple(reversed(named.values()))
+
+    @property
+    def repetitions(self) -> int:
+        """How often the last of them is there."""
+        return len(self.plans) - len(self.distinct) + 1
+
+    def reads_temperatures(self, simulated: bool) -> bool:
+        """Whether the session starts the thermometer driver and needs it."""
+        return self.kind == THERMAL if simulated else 'thermometers' in self.devices
 
 
 def load_session(path: Path | str, kind: str | None = None) -> SessionConfig:
@@ -102,47 +129,58 @@ def load_session(path: Path | str, kind: str | None = None) -> SessionConfig:
     Raises UserError naming file, key and what is expected.
     """
     path = Path(path)
-    try:
-        data = yaml.safe_load(path.read_text(encoding='utf-8'))
-    except (OSError, UnicodeDecodeError) as error:
-        raise UserError(f'{path}: cannot read the session file: {error}') from None
-    except yaml.YAMLError as error:
-        raise UserError(f'{path}: not valid YAML: {" ".join(str(error).split())}') from None
+    data = read_yaml(path, 'the session file')
     if not isinstance(data, dict):
         raise UserError(f'{path}: expected a mapping with machine, cycle and setups')
+    if 'cycle' not in data and 'dynamic' not in data:
+        raise UserError(f'{path}: cycle: missing; expected cycle, dynamic or both')
     reader = Reader(str(path), data)
     reader.only(_KEYS)
     machine = load_machine(path.parent / str(reader.required('machine')))
     radius = reader.number('sphere_radius_mm', 12.7, _RADIUS_MM) * 1e-3
-    kind, stations, dwell = _cycle(reader, machine, kind)
-    nest = reader.section('nest_calibration', {'step_mm', 'dwell_s'})
-    step = nest.number('step_mm', 1.0, _STEP_MM) * 1e-3
-    nest_dwell = nest.number('dwell_s', 0.3, _DWELL_S)
+    turning = _dynamic(reader, machine)
+    if 'cycle' in data:
+        kind, stations, dwell = _cycle(reader, machine, kind)
+    elif kind is not None:
+        raise UserError(f'{path}: cycle: missing; a {kind} cycle needs its stations')
+    else:
+        kind, stations, dwell = DYNAMIC, (), 0.0
+    nest = nest_kind(reader)
+    every, repetitions = _repetition(reader, kind)
     plans: list[CyclePlan] = []
     setups = reader.required('setups')
     if not isinstance(setups, dict) or not setups:
         raise UserError(f'{path}: setups: expected a mapping of names to sphere_mm')
+    if kind == THERMAL and len(setups) > 1:
+        raise UserError(
+            f'{path}: setups: expected one, which a thermal session repeats, got {len(setups)}'
+        )
     for name, spec in zip(_names(f'{path}: setups', setups), setups.values(), strict=True):
         setup = Reader(f'{path}: setups: {name}', spec if isinstance(spec, dict) else {})
         setup.only({'sphere_mm'})
         sphere = np.array(setup.numbers('sphere_mm', 3)) * 1e-3
-        plans.append(nest_calibration(machine, name, sphere, step, nest_dwell))
+        plans.append(calibration_plan(reader, nest, machine, name, sphere))
+        if len(plans) == 1:
+            plans += laser_checks(reader, nest, machine, name, sphere)
         if not any(plan.kind is Kind.SPINDLE_RUNOUT for plan in plans):
             runout = data.get('spindle_runout')
             if runout is not None:
                 section = reader.section('spindle_runout', {'stations', 'dwell_s'})
                 count = section.integer('stations', 24, _RUNOUT_STATIONS)
-                runout_dwell = section.number('dwell_s', 0.3, _DWELL_S)
+                runout_dwell = section.number('dwell_s', 0.3, DWELL_S)
                 plans.append(spindle_runout(machine, name, sphere, count, runout_dwell))
-        plans.append(_BUILD[kind](machine, name, sphere, *stations, dwell))
+        if kind in _BUILD:
+            cycle = _BUILD[kind](machine, name, sphere, *stations, dwell)
+            plans += thermal(cycle, repetitions) if kind == THERMAL else [cycle]
+        plans += [dynamic(machine, name, sphere, *each) for each in turning]
     for plan in plans:
         try:
             check_ranges(machine, plan)
         except UserError as error:
             raise UserError(f'{path}: setups: {plan.setup}: {error}') from None
     return SessionConfig(
-        machine, radius, tuple(plans), kind, stations, _speeds(reader), _approach(reader),
-        _table(reader), _spindle(reader), _devices(reader, path.parent), data,
+        machine, radius, nest, tuple(plans), kind, stations, _speeds(reader), _approach(reader),
+        _table(reader), _spindle(reader), _devices(reader, path.parent), data, every,
     )
 
 
@@ -151,7 +189,7 @@ def _cycle(
 ) -> tuple[str, tuple[np.ndarray, ...], float]:
     """Kind, stations of each rotary axis [rad], dwell [s]."""
     keys = {name: f'{name.lower()}_deg' for name in machine.rotary}
-    cycle = reader.section('cycle', {'kind', 'dwell_s', *keys.values()})
+    cycle = reader.section('cycle', {'kind', 'dwell_s', *PACE, *keys.values()})
     given = cycle.data.get('kind', STATIC)
     if given not in _BUILD:
         raise UserError(f'{cycle.where}: kind: expected {" or ".join(_BUILD)}, got {given!r}')
@@ -164,7 +202,56 @@ def _cycle(
             stations.append(np.radians(UNEVEN_DEG))
         else:
             stations.append(np.radians(_stations(cycle, key, machine.axes[name])))
-    return kind, tuple(stations), cycle.number('dwell_s', 0.3, _DWELL_S)
+    return kind, tuple(stations), cycle.number('dwell_s', 0.3, DWELL_S)
+
+
+def _repetition(reader: Reader, kind: str) -> tuple[float, int]:
+    """Of the cycles of a thermal session: time from start to start [s], and how many."""
+    cycle = Reader(f'{reader.where}: cycle', reader.data.get('cycle', {}))
+    if kind != THERMAL:
+        for key in PACE:
+            if key in cycle.data and cycle.data.get('kind') != THERMAL:
+                raise UserError(f'{cycle.where}: {key}: expected with kind: {THERMAL} only')
+        return 0.0, 1
+    every = cycle.number('every_min', 15.0, _EVERY_MIN)
+    cycle.required('hours')
+    minutes = 60.0 * cycle.number('hours', 0.0, _HOURS)
+    # A whole number of intervals may be a little less in floating point.
+    count = int(minutes / every + 1e-9) + 1
+    if not 2 <= count <= _MOST_CYCLES:
+        raise UserError(
+            f'{cycle.where}: {minutes / 60.0:g} h with a cycle every {every:g} min are {count} '
+            f'cycles; expected 2 to {_MOST_CYCLES}'
+        )
+    return 60.0 * every, count
+
+
+def _dynamic(reader: Reader, machine: Machine) -> list[tuple[str, float, float]]:
+    """Axis, speed [rad/s] and turns each way of every dynamic cycle; none without the section."""
+    if 'dynamic' not in reader.data:
+        return []
+    section = reader.section('dynamic', {'axis', 'speeds_deg_min', 'turns'})
+    axis, tables = section.required('axis'), [
+        name for name in machine.rotary if name in machine.table_side
+    ]
+    if axis not in tables:
+        raise UserError(
+            f'{section.where}: axis: expected a rotary axis of the table, {" or ".join(tables)}, '
+            f'got {axis!r}'
+        )
+    speeds, turns = section.numbers('speeds_deg_min'), section.numbers('turns')
+    if min(speeds) <= 0.0 or len(set(speeds)) < len(speeds):
+        raise UserError(
+            f'{section.where}: speeds_deg_min: expected different positive numbers, got {speeds}'
+        )
+    lower, upper = _TURNS
+    if len(turns) != len(speeds) or not all(lower <= value <= upper for value in turns):
+        raise UserError(
+            f'{section.where}: turns: expected {lower:g} to {upper:g} for each of the '
+            f'{len(speeds)} speeds, got {turns}'
+        )
+    return [(axis, math.radians(speed) / 60.0, turn)
+            for speed, turn in zip(speeds, turns, strict=True)]
 
 
 def _stations(cycle: Reader, key: str, axis: Axis) -> list[float]:

@@ -9,9 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from rtest_estimation.errors import UserError
+from rtest_estimation.yaml_text import read_yaml
 from rtest_identification.machine import Machine
 from rtest_identification.symbols import ErrorParameter, location_parameters, map_parameters
 
@@ -118,12 +117,7 @@ def load_tolerances(path: Path | str) -> Tolerances:
 
     Raises UserError naming file, key and what is expected.
     """
-    try:
-        data = yaml.safe_load(Path(path).read_text(encoding='utf-8'))
-    except (OSError, UnicodeDecodeError) as error:
-        raise UserError(f'{path}: cannot read the tolerance file: {error}') from None
-    except yaml.YAMLError as error:
-        raise UserError(f'{path}: not valid YAML: {" ".join(str(error).split())}') from None
+    data = read_yaml(path, 'the tolerance file')
     if not isinstance(data, dict):
         raise UserError(f'{path}: expected a mapping of symbols and groups to limits')
     factor = _factor(data.pop(COVERAGE, 2.0), str(path))

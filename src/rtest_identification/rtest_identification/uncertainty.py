@@ -20,11 +20,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import yaml
 from scipy import stats
 
 from rtest_estimation.errors import UserError
 from rtest_estimation.records import Cycle, Kind
+from rtest_estimation.yaml_text import read_yaml
 from rtest_identification.kinematics import ERROR_LETTERS
 from rtest_identification.location import Estimate
 from rtest_identification.machine import Machine
@@ -103,12 +103,7 @@ def load_priors(path: Path | str, machine: Machine) -> dict[str, AxisPrior]:
 
     Raises UserError naming file, key and what is expected.
     """
-    try:
-        data = yaml.safe_load(Path(path).read_text(encoding='utf-8'))
-    except (OSError, UnicodeDecodeError) as error:
-        raise UserError(f'{path}: cannot read the priors: {error}') from None
-    except yaml.YAMLError as error:
-        raise UserError(f'{path}: not valid YAML: {" ".join(str(error).split())}') from None
+    data = read_yaml(path, 'the priors')
     axes = data.get('linear_axes') if isinstance(data, dict) and len(data) == 1 else None
     if not isinstance(axes, dict) or not axes:
         raise UserError(f'{path}: expected the one key linear_axes, a mapping of axis letters')

@@ -6,7 +6,13 @@ from independent import NMV, chain_centre
 from scipy.spatial.transform import Rotation
 
 from rtest_estimation.errors import UserError
-from rtest_identification.frustum.commands import NEGATIVE, POSITIVE, command, tool_axis
+from rtest_identification.frustum.commands import (
+    NEGATIVE,
+    POSITIVE,
+    command,
+    out_of_range,
+    tool_axis,
+)
 from rtest_identification.frustum.cone import Frustum
 from rtest_identification.frustum.feature import Feature
 from rtest_identification.frustum.thesis import CASES, frustum
@@ -115,6 +121,18 @@ def test_through_the_singularity_the_axes_go_on():
     assert not upright.positions[:, 3:].any()
 
 
+def test_near_a_pole_the_note_says_how_fast_the_axis_turns():
+    # B passes zero at 0.1 deg; C makes half a turn there, over about twice that on the path.
+    made = command(MACHINE, frustum(29.9, (-60.0, 0.0, 120.0)).feature(7200))
+    (note,) = (text for text in made.notes if 'pole' in text)
+    assert note.startswith('at point 3601 the tool comes within 0.1 deg of a pole (along C)')
+    # The tool's axis goes round a cone of 30 deg while the tip goes round a circle of 64.95 mm:
+    # 0.441 deg a mm, at 0.1 deg from the pole a turn of 0.441 / sin 0.1 deg.
+    rate = np.degrees(np.sin(np.radians(30.0)) / 64.95 / np.sin(np.radians(0.1)))
+    assert float(note.split('up to ')[1].split(' deg')[0]) == pytest.approx(rate, rel=0.03)
+    assert not any('pole' in text for text in command(MACHINE, CASES['a'].feature()).notes)
+
+
 @pytest.mark.parametrize('sense', [1, -1])
 @pytest.mark.parametrize('name', CHAINS)
 def test_any_chain_points_the_tool_and_holds_the_tip(name, sense):
@@ -171,6 +189,13 @@ def test_axes_out_of_range_are_told():
     # Where errors were measured counts as well.
     inside = command(MACHINE, CASES['a'].feature(), inside=lambda p: p[:, 3] > 0)
     assert inside.axis('B').min() > 0
+
+
+def test_a_little_out_of_range_is_seen():
+    rows = np.zeros((2, 5))
+    rows[1, 1] = 0.1050117
+    note = out_of_range(MACHINE, rows)['Y']
+    assert note.startswith('Y goes from 0.0000 to 105.0117 mm, its range is -105 to 105')
 
 
 def test_mistakes_are_told():

@@ -135,7 +135,8 @@ def broken(line, text):
         (broken(7, '1,2,3,0,0,2'), r'path\.csv:7: i, j, k: expected a unit vector, got length 2'),
         (broken(2, 'x_mm,y_mm,z_mm,i,j,i'), r'path\.csv:2: two columns of one name'),
         (broken(2, 'x_mm,y_mm,z_m,i,j,k'), 'expected x_mm, y_mm, z_mm, i, j, k'),
-        (broken(2, 'X_mm,Y_mm,Z_mm,B_deg,A_deg,nz'), 'expected X_mm, Y_mm, Z_mm, B_deg, C_deg'),
+        (broken(2, 'X_mm,Y_mm,Z_mm,B_deg,A_deg,nz'), 'or X_mm, Y_mm, Z_mm, B_deg, C_deg'),
+        (broken(2, 'x_in,y_in,z_in,i,j,k'), 'j, k, or X_mm, Y_mm, Z_mm, B_deg, C_deg, each with'),
         ('\n'.join(tip_table().splitlines()[:6]), '4 points, expected 7 to 20000'),
         ('\n'.join([TIP_HEADER, *['1,2,3,0,0,1'] * 9]), r'path\.csv:2: .*give nx, ny, nz'),
         (TIP_HEADER + '\n', '0 points'),
@@ -160,7 +161,9 @@ def test_mistakes_in_a_table(tmp_path, text, message):
         (20, 'X1 Y', "'Y': expected a letter with a number"),
         (20, 'G1 X1 (OPEN', r"'\(OPEN': expected a letter"),
         (20, 'G1 X1 R5', 'R5: not one of the words'),
-        (20, 'G0 G1 X1', 'G0 and G1 in one block'),
+        (20, 'G0 G1 X1', 'two of G0 and G1 in one block'),
+        (20, 'G1 X1 G1 Y1', 'two of G0 and G1 in one block; give each its own'),
+        (20, 'G4 X1 Y2', r'a dwell \(G4\) in one block with a move'),
         (20, 'A10', 'A10: not one of the words'),
         (10, 'X1', 'axes move before any G0 or G1'),
         (10, 'G0 X1 Y1 Z1 B1', 'where C start from is not known'),
@@ -175,6 +178,25 @@ def test_mistakes_in_a_program(tmp_path, line, text, message):
     number = int(str(caught.value).split('path.ngc:')[1].split(':')[0])
     assert number in (line, 12)
     assert '\n' not in str(caught.value)
+
+
+def test_a_dwell_by_x_and_what_follows_a_percent_sign_move_nothing(tmp_path):
+    plain = load_path(saved(tmp_path, 'a.ngc', program()), MACHINE)
+    text = program().replace('F1000\n', 'F1000\nG4 X1\n').replace('M30\n', '%\nX100 Y100\n')
+    same = load_path(saved(tmp_path, 'b.ngc', text), MACHINE)
+    np.testing.assert_array_equal(same.positions, plain.positions)
+    # Every point knows the line that it is on: one for the dwell, 12 is the first block.
+    assert plain.where(0) == 'a.ngc:12' and same.where(0) == 'b.ngc:13'
+    table = load_path(saved(tmp_path, 'c.csv', tip_table()), MACHINE)
+    assert table.where(1) == 'c.csv:4'
+
+
+def test_choices_that_would_say_nothing_are_refused(tmp_path):
+    with pytest.raises(UserError, match='has normals, so --surface says nothing'):
+        load_path(saved(tmp_path, 'a.csv', tip_table(True)), MACHINE, RIGHT)
+    for path in (write_commands(MADE, tmp_path), saved(tmp_path, 'a.ngc', program())):
+        with pytest.raises(UserError, match='gives the positions of the axes: leave --solution'):
+            load_path(path, MACHINE, solution='negative')
 
 
 def test_nothing_to_judge(tmp_path):

@@ -8,6 +8,7 @@ import pytest
 from independent import NMV, SETUPS, nest_cycle, static_cycle
 
 from rtest_estimation.errors import UserError
+from rtest_identification.frustum import figures
 from rtest_identification.machine import parse_machine
 from rtest_identification.output import as_dict
 from rtest_identification.pipeline import identify
@@ -93,11 +94,14 @@ def test_of_a_model(tmp_path, capsys, machine_file):
 
 
 def test_of_nothing_known_and_of_a_path(tmp_path, capsys, machine_file):
-    last = told(capsys, '--machine', machine_file, '--phi', 20, '--psi', 10, '--diameter', 60,
-                '--centre', 0, 10, 90, '--centre-of', 'path',
-                '--out', tmp_path / 'a')[-1]  # fmt: skip
-    assert 'errors ranked, largest' in last
-    check(tmp_path / 'a', 'ranking', 'profiles', 'setup', 'commands')
+    lines = told(capsys, '--machine', machine_file, '--phi', 20, '--psi', 10, '--diameter', 60,
+                 '--centre', 0, 10, 90, '--centre-of', 'path',
+                 '--out', tmp_path / 'a')  # fmt: skip
+    assert 'errors ranked, largest' in lines[-1]
+    # A key is followed by what it stands for.
+    formula = 'E_AC, E_BC = a cos 2C + b sin 2C each'
+    assert any(f'coning/C.2 (0.01°): {formula}' in line for line in lines)
+    assert formula in check(tmp_path / 'a', 'ranking', 'profiles', 'setup', 'commands')
     cone = json.loads((tmp_path / 'a/frustum.json').read_text())['cone']
     lever = 0.03 * np.tan(np.radians(10))
     np.testing.assert_allclose(
@@ -139,6 +143,10 @@ def test_the_tables(tmp_path, capsys):
         (['--machine', 'absent.yaml'], 'cannot read the machine file'),
         (['--identification', 'absent.json'], 'cannot read the identification'),
         (['--phi', 75], None),
+        (['--centre', '1e308', 0, 0], '--centre: expected three numbers of mm'),
+        (['--diameter', '1e308'], '--diameter'),
+        (['--tables', '--solution', 'negative'], '--solution: --tables are of'),
+        (['--surface', 'left'], '--surface is of a --path'),
     ],
 )
 def test_mistakes(tmp_path, words, message, identification, machine_file):
@@ -149,6 +157,66 @@ def test_mistakes(tmp_path, words, message, identification, machine_file):
     with pytest.raises(UserError, match=message):
         run(*words, '--out', tmp_path / 'out')
     assert not (tmp_path / 'out').exists()
+
+
+def test_older_results_are_not_mixed_with_new_ones(tmp_path):
+    (tmp_path / 'contour.png').write_text('old')
+    with pytest.raises(UserError, match='is not empty; choose another --out'):
+        run('--tables', '--out', tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ['contour.png']
+
+
+def changed(identification, tmp_path, change):
+    data = json.loads(identification.read_text())
+    change(data)
+    path = tmp_path / 'changed.json'
+    path.write_text(json.dumps(data))
+    return path
+
+
+def test_what_was_not_determined_is_in_the_last_line(
+    tmp_path, capsys, machine_file, identification
+):
+    path = changed(identification, tmp_path,
+                   lambda data: data['location_errors']['E_Y(0Y)B'].update(value=None))
+    last = told(capsys, '--machine', machine_file, '--identification', path,
+                '--out', tmp_path / 'o')[-1]  # fmt: skip
+    assert '; without E_Y(0Y)B, not determined and in no value or U' in last
+    assert json.loads((tmp_path / 'o/frustum.json').read_text())['not_determined'] == ['E_Y(0Y)B']
+
+
+@pytest.mark.parametrize(
+    ('change', 'match'),
+    [
+        (lambda d: d['location_errors']['E_Y(0Y)B'].update(value=float('nan')), 'value nan'),
+        (lambda d: d['location_errors']['E_Y(0Y)B'].update(value='1e-5'), "value '1e-5', expect"),
+        (lambda d: d['location_errors']['E_Y(0Y)B'].update(unit='um'), "unit 'um', expected 'm'"),
+        (lambda d: d.update(error_maps=None), 'error_maps: expected maps by axis'),
+        (lambda d: d['uncertainty']['covariance'][0].__setitem__(0, -1e-12), 'is negative'),
+        (lambda d: d['error_maps']['B'].update({'E_X(Y)B': None}), 'not an identification.json'),
+    ],
+)
+def test_a_broken_identification_is_told(tmp_path, machine_file, identification, change, match):
+    path = changed(identification, tmp_path, change)
+    with pytest.raises(UserError, match=match) as caught:
+        run('--machine', machine_file, '--identification', path, '--out', tmp_path / 'o')
+    assert str(path) in str(caught.value) and '\n' not in str(caught.value)
+
+
+def test_outside_the_stations_a_path_names_its_line(tmp_path, machine_file, identification):
+    path = tmp_path / 'out.ngc'
+    path.write_text('G0 X0 Y0 Z50 B0 C0\n(then)\nG1 X50 B-90 F500\n')
+    match = r'^out\.ngc:3: B = -75\.\d+, C = 0 deg is outside'
+    with pytest.raises(UserError, match=match) as found:
+        run('--machine', machine_file, '--identification', identification, '--path', path,
+            '--out', tmp_path / 'o')
+    # C is where it was measured.
+    assert 'B (-75 to 75 deg): measure' in str(found.value)
+    assert 'whole turn' not in str(found.value)
+
+
+def test_a_ranking_of_nothing_says_so():
+    assert 'no error' in figures.ranking([], 'form deviation').axes[0].texts[0].get_text()
 
 
 def test_an_identification_of_another_machine_is_refused(tmp_path, identification):

@@ -14,6 +14,7 @@ from rtest_identification.nc_program import NcSettings, nc_program
 from rtest_identification.plans import (
     UNEVEN_DEG,
     diagnostic,
+    dynamic,
     nest_calibration,
     spindle_runout,
     static,
@@ -219,3 +220,35 @@ def test_axes_that_no_program_can_name_are_refused():
     plan = static(odd, '1a', np.array(SETUPS['1a']), B, np.radians([0, 120]))
     with pytest.raises(UserError, match='C1'):
         nc_program(odd, plan, synchronous_path(odd, plan), Approach(), NcSettings())
+
+
+@pytest.mark.parametrize('speed', [358.0, 3583.0])
+def test_a_dynamic_cycle_turns_at_its_feed_along_the_circle(speed):
+    omega = np.radians(speed) / 60.0
+    plan = dynamic(MACHINE, '1a', np.array(SETUPS['1a']), 'C', omega, 2.0)
+    moves, events, _ = read(written(plan))
+    start, end = (
+        next(count for count, text in events if text == f'POSE {pose}') - 1 for pose in (0, 1)
+    )
+    way = [row for _, row, _ in moves[start:end + 1]]
+    seconds = [time for _, _, time in moves[start + 1:end + 1]]
+    # Two turns from -360 deg; every block takes its part of the time, 20 ms at least.
+    assert sum(seconds) == pytest.approx(720.0 / (speed / 60.0), rel=1e-4)
+    assert min(seconds) > 0.0199
+    worst = max(
+        np.linalg.norm(on_machine(0.5 * (one + other)) - 1e3 * plan.sphere)
+        for one, other in pairwise(way)
+    )
+    # The sagitta of 1 um, or of 1.2 deg where blocks of 20 ms are longer: 90 mm (0.6 deg)^2 / 2.
+    assert worst < (1.1e-3 if speed < 1000 else 5.2e-3)
+    assert [text for _, text in events].count('G4 P1.000') == 3
+
+
+def test_in_tcp_mode_a_pass_is_one_block():
+    plan = dynamic(MACHINE, '1a', np.array(SETUPS['1a']), 'C', np.radians(60.0), 2.0)
+    moves, events, _ = read(written(plan, tcp=True))
+    first = next(count for count, text in events if text == 'POSE 0')
+    (_, there, seconds), (_, back, same) = moves[first:first + 2]
+    np.testing.assert_allclose(there, [*1e3 * plan.sphere, 0.0, 360.0], atol=1e-4)
+    np.testing.assert_allclose(back, [*1e3 * plan.sphere, 0.0, -360.0], atol=1e-4)
+    assert seconds == same == pytest.approx(12.0, rel=1e-3)

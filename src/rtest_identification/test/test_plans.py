@@ -5,11 +5,12 @@ import pytest
 from independent import NMV, B, C
 
 from rtest_estimation.errors import UserError
+from rtest_estimation.records import Kind
 from rtest_identification.error_map import STATION, stations
 from rtest_identification.kinematics import predict
 from rtest_identification.machine import parse_machine
 from rtest_identification.moves import synchronous_path
-from rtest_identification.plans import OVERRUN, UNEVEN_DEG, diagnostic, static
+from rtest_identification.plans import OVERRUN, UNEVEN_DEG, diagnostic, program_name, static
 from rtest_identification.session_file import load_session
 
 MACHINE = parse_machine(NMV)
@@ -122,6 +123,43 @@ def test_a_diagnostic_cycle_takes_uneven_stations_unless_the_file_gives_its_own(
     assert changed.plans[-1].cycle == '1a-diagnostic'
 
 
+THERMAL = SESSION.replace('cycle: {', 'cycle: {kind: thermal, every_min: 0.7, hours: 0.035, ')
+
+
+def test_a_thermal_session_repeats_one_static_cycle(tmp_path):
+    config = load_session(session(tmp_path, THERMAL))
+    # 2.1 min hold three intervals of 0.7 min, which binary fractions do not know.
+    names = [f'1a-thermal-{number:02d}' for number in range(1, 5)]
+    assert [plan.cycle for plan in config.plans] == ['1a-nest', *names]
+    assert (config.every, config.repetitions) == (pytest.approx(42.0), 4)
+    assert [plan.cycle for plan in config.distinct] == ['1a-nest', '1a-thermal-01']
+    once = load_session(session(tmp_path)).plans[-1]
+    for plan in config.plans[1:]:
+        assert plan.kind is once.kind
+        np.testing.assert_array_equal(plan.commands, once.commands)
+    assert [program_name(name) for name in (*names, '1a-static', '1a-thermal')] == [
+        *['1a-thermal'] * 4, '1a-static', '1a-thermal',
+    ]
+
+
+@pytest.mark.parametrize(
+    ('old', 'new', 'words'),
+    [
+        (' hours: 0.035,', '', 'cycle: hours: missing'),
+        ('every_min: 0.7', 'every_min: 0', 'cycle: every_min: expected 0.1 to 1440'),
+        ('every_min: 0.7', 'every_min: 3', '0.035 h with a cycle every 3 min are 1 cycles'),
+        ('hours: 0.035', 'hours: 300', 'are 25715 cycles; expected 2 to 2000'),
+        ('kind: thermal', 'kind: static', 'every_min: expected with kind: thermal only'),
+        ('setups:', 'setups:\n  2a: {sphere_mm: [0, -60, 40]}', 'setups: expected one, which'),
+    ],
+)
+def test_mistakes_in_a_thermal_session_are_told_in_one_line(tmp_path, old, new, words):
+    assert old in THERMAL
+    with pytest.raises(UserError) as caught:
+        load_session(session(tmp_path, THERMAL.replace(old, new, 1)))
+    assert words in str(caught.value) and '\n' not in str(caught.value)
+
+
 def test_speeds_approach_table_and_spindle_are_read(tmp_path):
     config = load_session(session(tmp_path, SESSION + """
 moves: {linear_mm_min: 1200, rotary_deg_min: 300, clearance_mm: 30, approach_mm_min: 60,
@@ -138,10 +176,40 @@ spindle: {radius_mm: 45, distance_mm: 160}
     assert config.spindle.radius == pytest.approx(0.045)
 
 
+TURNING = 'dynamic: {axis: C, speeds_deg_min: [358, 3583], turns: [1, 2]}\n'
+
+
+def test_dynamic_cycles_follow_the_static_one_or_stand_alone(tmp_path):
+    both = load_session(session(tmp_path, SESSION + TURNING))
+    assert [p.cycle for p in both.plans] == [
+        '1a-nest', '1a-static', '1a-dynamic-358', '1a-dynamic-3583']
+    without = '\n'.join(line for line in SESSION.splitlines() if not line.startswith('cycle'))
+    alone = load_session(session(tmp_path, without + '\n' + TURNING))
+    assert (alone.kind, alone.stations) == ('dynamic', ())
+    slow, fast = alone.plans[1:]
+    assert slow.kind is Kind.DYNAMIC and slow.dwell == 0.0
+    assert np.degrees(slow.feed) * 60.0 == pytest.approx(358.0)
+    # To and fro, with two turns around zero where the axis has one to each side.
+    np.testing.assert_allclose(np.degrees(slow.commands[:, 4]), [0, 360, 0], atol=1e-9)
+    np.testing.assert_allclose(np.degrees(fast.commands[:, 4]), [-360, 360, -360], atol=1e-9)
+    with pytest.raises(UserError, match='cycle: missing'):
+        load_session(session(tmp_path, without + '\n' + TURNING), 'static')
+    with pytest.raises(UserError, match='expected cycle, dynamic or both'):
+        load_session(session(tmp_path, without))
+
+
 @pytest.mark.parametrize(
     ('old', 'new', 'words'),
     [
         ('cycle: {', 'cycle: {kind: dynamic, ', 'kind: expected static or diagnostic'),
+        ('cycle:', 'dynamic: {axis: X}\ncycle:', 'axis: expected a rotary axis of the table'),
+        ('cycle:', 'dynamic: {axis: C}\ncycle:', 'dynamic: speeds_deg_min: missing'),
+        ('cycle:', 'dynamic: {axis: C, speeds_deg_min: [9, 9], turns: [1, 1]}\ncycle:',
+         'expected different positive numbers'),
+        ('cycle:', 'dynamic: {axis: C, speeds_deg_min: [9, 90], turns: [1]}\ncycle:',
+         'turns: expected 0.25 to 100 for each of the 2 speeds'),
+        ('cycle:', 'dynamic: {axis: C, speeds_deg_min: [9], turns: [3]}\ncycle:',
+         'C = -540.000 deg is outside'),
         ('{b_deg: [-75, 0, 75],', '{', 'b_deg: missing'),
         ('{b_deg: [-75, 0, 75],', '{kind: diagnostic,', 'b_deg: missing'),
         ('b_deg', 'a_deg', "unknown key 'a_deg'"),

@@ -240,3 +240,42 @@ def test_table_3_2_with_smooth_maps_of_b_comes_back_within_its_uncertainty():
     # U (k = 2) holds 95.4 %; 1320 and 5040 values, correlated within a session.
     assert 0.935 <= np.mean(held) <= 0.975
     assert 0.94 <= np.mean(held_map) <= 0.97
+
+
+def with_waves(b, c):
+    """A map of C besides, so that everything is fitted together."""
+    errors = with_map(b, c)
+    own = errors.setdefault('C', {})
+    errors['C'] = own | {
+        'X': own.get('X', 0.0) + 1.5e-6 * np.cos(2 * c),
+        'A': own.get('A', 0.0) + 8e-6 * np.sin(3 * c) * abs(b),
+    }
+    return errors
+
+
+def test_location_errors_and_map_scatter_together_as_stated():
+    rng = np.random.default_rng(25)
+    made = [static_cycle(setup, with_waves) for setup in SETUPS]
+    results = [
+        fit(stack(MACHINE, [noisy(cycle, SIGMA, rng) for cycle in made])) for _ in range(40)
+    ]
+    assert all(result.joint and result.joint_inner for result in results)
+    stated = np.mean([result.across for result in results], axis=0)
+    own = [np.mean([one.location.stddev**2 for one in results], axis=0),
+           np.mean([np.diag(one.error_map.covariance) for one in results], axis=0)]
+    scale = np.sqrt(np.outer(*own))
+    drawn = np.array([
+        np.concatenate([one.location.value, one.error_map.value.ravel()]) for one in results
+    ])
+    seen = np.cov(drawn.T)[: len(VALUES), len(VALUES) :]
+    high = np.abs(stated) > 0.1 * scale
+    assert high.sum() > 20
+    slope = (seen[high] @ stated[high]) / (stated[high] @ stated[high])
+    assert slope == pytest.approx(1.0, abs=0.25)
+    np.testing.assert_allclose(seen / scale, stated / scale, atol=5 / np.sqrt(40))
+    # Together they are a covariance.
+    one = results[0]
+    joint = np.block([[one.location.covariance, one.across],
+                      [one.across.T, one.error_map.covariance]])
+    scale = np.sqrt(np.diag(joint))
+    assert np.linalg.eigvalsh(joint / np.outer(scale, scale)).min() > -1e-9

@@ -12,6 +12,8 @@ import numpy as np
 LENGTHS = {'m': 1.0, 'mm': 1e-3, 'um': 1e-6, 'inch': 25.4e-3}
 ANGLES = {'rad': 1.0, 'deg': math.pi / 180.0}
 UNITS = {**LENGTHS, **ANGLES}
+# No axis is as long or turns as far [m], [rad]: such a value is a fault, not a position.
+_FARTHEST = {'length': 1e3, 'angle': math.radians(1e6)}
 
 
 @dataclass(frozen=True)
@@ -33,6 +35,11 @@ class AxisSource:
     def scale(self) -> float:
         """Controller's value to [m] or [rad]."""
         return self.sign * UNITS[self.unit]
+
+    def plausible(self, value: float) -> bool:
+        """Whether a controller's value can be a position: finite, within 1 km or 1e6 deg."""
+        farthest = _FARTHEST['length' if self.unit in LENGTHS else 'angle']
+        return abs(value * self.scale) < farthest
 
 
 def names(axes: Sequence[AxisSource]) -> tuple[str, ...]:

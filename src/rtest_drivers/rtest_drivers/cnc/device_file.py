@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
-
-import yaml
 
 from rtest_drivers.cnc.axes import LENGTHS, UNITS, AxisSource
 from rtest_estimation.dwell import ROTARY_LETTERS
 from rtest_estimation.errors import UserError
+from rtest_estimation.yaml_text import read_yaml
 from rtest_identification.session_reader import Reader
 
 
@@ -59,6 +57,7 @@ class DeviceReader(Reader):
             raise UserError(f'{where}: expected a mapping of {key}, unit and sign')
         axis = DeviceReader(where, spec)
         axis.only({key, 'unit', 'sign'})
+        axis.required(key)
         source: str | int = axis.integer(key, -1, (0, 99)) if kind is int else axis.text(key)
         unit = axis.text('unit')
         if unit not in UNITS:
@@ -67,9 +66,9 @@ class DeviceReader(Reader):
             turns = 'rotary' if name in ROTARY_LETTERS else 'linear'
             raise UserError(f'{where}: unit: {unit} is no unit of the {turns} axis {name}')
         sign = spec.get('sign', 1)
-        if sign not in (1, -1) or isinstance(sign, bool):
+        if type(sign) is not int or sign not in (1, -1):
             raise UserError(f'{where}: sign: expected 1 or -1, got {sign!r}')
-        return AxisSource(name, source, unit, int(sign))
+        return AxisSource(name, source, unit, sign)
 
 
 def load(path: str, known: set[str]) -> DeviceReader:
@@ -77,12 +76,7 @@ def load(path: str, known: set[str]) -> DeviceReader:
 
     Raises UserError naming file, key and what is expected.
     """
-    try:
-        data = yaml.safe_load(Path(path).read_text(encoding='utf-8'))
-    except (OSError, UnicodeDecodeError) as error:
-        raise UserError(f'{path}: cannot read the device file: {error}') from None
-    except yaml.YAMLError as error:
-        raise UserError(f'{path}: not valid YAML: {" ".join(str(error).split())}') from None
+    data = read_yaml(path, 'the device file')
     if not isinstance(data, dict):
         raise UserError(f'{path}: expected a mapping of {sorted(known)}')
     reader = DeviceReader(path, data)

@@ -26,6 +26,7 @@ import time
 from dataclasses import dataclass
 from typing import Any
 
+from rtest_drivers.addresses import host_is_good
 from rtest_drivers.clock import HostClock
 from rtest_drivers.cnc.axes import AxisSource, names, scales
 from rtest_drivers.cnc.clock import Recent
@@ -79,8 +80,11 @@ def load_linuxcnc(path: str) -> LinuxCncFile:
     for key, word in zip(('password', 'enable_password'), passwords, strict=True):
         if any(character.isspace() for character in word):
             raise UserError(f'{path}: {key}: linuxcncrsh takes no password with spaces')
+    host = reader.text('host', '127.0.0.1')
+    if not host_is_good(host):
+        raise UserError(f'{path}: host: expected the name or address of a host, got {host!r}')
     return LinuxCncFile(
-        reader.text('host', '127.0.0.1'),
+        host,
         reader.integer('port', 5007, (1, 65535)),
         *passwords,
         reader.number('rate_hz', 200.0, (1.0, 1000.0)),
@@ -213,6 +217,12 @@ class LinuxCnc:
         values = positions(told)
         if len(values) != self._count:
             raise ReplyError(f'{line.where} told {len(values)} joints instead of {self._count}')
+        for axis in self._file.axes:
+            if not axis.plausible(values[axis.source]):
+                raise ReplyError(
+                    f'axis {axis.name}: {line.where} says {values[axis.source]:g} {axis.unit}, '
+                    'which is no position; look at the encoder and its scale'
+                )
         if (said := (told, self._state and self._state.line)) != self._said:
             self._said, self._changed = said, time.monotonic()
         if came - sent > _LATE_NS:
@@ -237,8 +247,15 @@ class LinuxCnc:
                     f'axes: {axis.name}: index {axis.source}: LinuxCNC tells joints 0 to '
                     f'{count - 1} only; correct the device file'
                 )
-            unit = UNIT_WORDS.get(units[axis.source]) if axis.source < len(units) else None
-            if unit not in (None, axis.unit):
+            word = units[axis.source] if axis.source < len(units) else 'nothing'
+            unit = UNIT_WORDS.get(word)
+            if unit is None:
+                raise ConnectionError(
+                    f'axes: {axis.name}: unit: LinuxCNC says {word}, expected one of '
+                    f'{list(UNIT_WORDS)}; set LINEAR_UNITS or ANGULAR_UNITS of [TRAJ] to one of '
+                    'these in the INI file of LinuxCNC'
+                )
+            if unit != axis.unit:
                 raise ConnectionError(
                     f'axes: {axis.name}: unit: LinuxCNC says {unit}, the device file '
                     f'{axis.unit}; correct the device file'

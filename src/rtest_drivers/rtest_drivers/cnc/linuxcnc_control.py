@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -19,6 +20,9 @@ _LOOK_S = 0.02
 _MESSAGES = 64
 # The axes have stopped where the position has been the same for so long.
 _STILL_S = 0.3
+# Motion modes that may stand in a block alone, distance modes, feed modes.
+_RESTORED = ('G0', 'G1', 'G80', 'G90', 'G91', 'G93', 'G94', 'G95')
+_RESTORE_S = 2.0
 
 
 class Control:
@@ -64,6 +68,18 @@ class Control:
         line = self._open_line()
         told = [line.get('error') for _ in range(_MESSAGES)]
         return [text for text in told if text != 'OK']
+
+    def check_idle(self) -> None:
+        """Raise UserError where a program runs or is paused."""
+        if (now := self.state()).program != 'IDLE':
+            raise UserError(f'LinuxCNC: a program is {now.program.lower()}; end it first')
+
+    def modes(self) -> tuple[str, str]:
+        """Blocks that restore the units, and distance, feed and motion mode as they are now."""
+        codes = self._open_line().get('program_codes').split()
+        units = [code for code in codes if code in ('G20', 'G21')]
+        others = [code for code in codes if code in _RESTORED or code[:1] == 'F']
+        return ' '.join(units), ' '.join(others)
 
     def machine_on(self) -> None:
         """E-stop off, machine on."""
@@ -150,19 +166,37 @@ def make_moves(
     """Make every move and the way back, and record the feedback of it.
 
     The machine moves: at 300 mm/min and 300 deg/min, in the active coordinate system. `backend` is
-    open. Returns (n, k) feedback [m], [rad] for each move, for `sense.judge`. Raises UserError
-    where an axis has not stopped after `timeout` [s] or LinuxCNC has an error.
+    open. Units, feed, distance, feed and motion mode are afterwards as before, also when a move
+    ends early, which stops the axes. Returns (n, k) feedback [m], [rad] for each move, for
+    `sense.judge`. Raises UserError where a program is not at its end, an axis has not stopped
+    after `timeout` [s] or LinuxCNC has an error.
     """
+    control.check_idle()
+    modes = control.modes()
     control.errors()
     recorded = []
-    for move in moves:
-        before = _until_still(backend, timeout)
-        recorded.append(np.vstack([before, _moved(control, backend, move, timeout)]))
-        _moved(control, backend, Move(move.axis, -move.distance), timeout)
-        if errors := control.errors():
-            raise UserError(f'LinuxCNC: {"; ".join(errors)}')
-    control.mdi('G90')
+    try:
+        for move in moves:
+            before = _until_still(backend, timeout)
+            recorded.append(np.vstack([before, _moved(control, backend, move, timeout)]))
+            _moved(control, backend, Move(move.axis, -move.distance), timeout)
+            if errors := control.errors():
+                raise UserError(f'LinuxCNC: {"; ".join(errors)}')
+    except BaseException:
+        # What went wrong is told, not that LinuxCNC cannot be reached for this.
+        with contextlib.suppress(ConnectionError, UserError):
+            control.abort()
+            _restore(control, modes)
+        raise
+    _restore(control, modes)
     return recorded
+
+
+def _restore(control: Control, modes: tuple[str, str]) -> None:
+    # A feed is one in the units before the block.
+    for block in filter(None, modes):
+        control.mdi(block)
+    control.wait(lambda now: control.modes() == modes, _RESTORE_S, 'its modes were not restored')
 
 
 def _moved(control: Control, backend: LinuxCnc, move: Move, timeout: float) -> np.ndarray:

@@ -21,6 +21,8 @@ _SET_S = 2.0
 _CONNECT_S = 2.0
 _TRIES = 4
 _SILENCE_S = 0.02
+# For a server that talks without end.
+_DISCARD_S = 0.5
 
 
 class Line:
@@ -88,6 +90,11 @@ class Line:
             reply = self.ask(f'hello {password} rtest 1.1')
             if not reply.endswith('NAK'):
                 break
+        if reply.split()[:1] != ['HELLO']:
+            raise ReplyError(
+                f'{self.where} is none, it says {reply[:60]!r}; set host and port of the device '
+                'file to those of linuxcncrsh'
+            )
         if reply.split()[:2] != ['HELLO', 'ACK']:
             raise ReplyError(
                 f'{self.where} does not let us in ({reply[:60]!r}); set password of the '
@@ -102,8 +109,10 @@ class Line:
 
     def _discard(self) -> None:
         """What comes after an answer to something else, so that no later one is mistaken."""
+        limit = time.monotonic() + _DISCARD_S
         while self.reply(_SILENCE_S) is not None:
-            pass
+            if time.monotonic() > limit:
+                raise ReplyError(f'{self.where} talks without being asked; is it linuxcncrsh?')
 
     def send(self, request: str) -> None:
         """Send a request, without its reply."""
@@ -115,12 +124,13 @@ class Line:
 
     def reply(self, timeout: float) -> str | None:
         """The next line, None where none came in `timeout` [s]."""
-        limit = time.monotonic() + timeout
+        limit, left = time.monotonic() + timeout, timeout
         while (line := take_line(self._buffer)) is None:
+            if left < 0.0:
+                return None  # Something comes, but no line.
+            left = limit - time.monotonic()
             try:
-                ready, _, _ = select.select(
-                    [self._socket], [], [], max(0.0, limit - time.monotonic())
-                )
+                ready, _, _ = select.select([self._socket], [], [], max(0.0, left))
                 data = self._socket.recv(4096) if ready else None
             except OSError as error:
                 raise self._lost(error.strerror or str(error)) from None

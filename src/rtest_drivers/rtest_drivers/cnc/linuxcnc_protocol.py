@@ -13,8 +13,9 @@ import numpy as np
 
 # No reply is as long; the server writes from a buffer of this size.
 LONGEST = 4096
-_NUMBER = re.compile(r'-?\d+\.\d+')
-# What `get joint_units` says of a joint, as units of the device file.
+_NUMBER = re.compile(r'-?[0-9]+\.[0-9]+')
+# What `get joint_units` says of a joint, as units of the device file. It can also be CM, GRAD, or
+# CUSTOM for any other: then the device file could not be held to anything.
 UNIT_WORDS = {'MM': 'mm', 'INCH': 'inch', 'DEG': 'deg', 'RAD': 'rad'}
 
 

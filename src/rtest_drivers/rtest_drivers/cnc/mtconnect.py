@@ -36,6 +36,7 @@ from rtest_drivers.cnc.mtconnect_agent import Agent
 from rtest_drivers.cnc.mtconnect_xml import (
     UNAVAILABLE,
     UNIT_WORDS,
+    DocumentError,
     Header,
     Item,
     Observation,
@@ -51,6 +52,8 @@ _KEYS = {'url', 'device', 'period_ms', 'stamp', 'skew_ms', 'axes'}
 # Observations asked for at once.
 _COUNT = 1000
 _TOLD_S = 2.0
+# For a whole /probe document, which is large.
+_PROBE_S = 5.0
 # Types of data items that say something of the whole machine, found by themselves.
 _ESTOP, _AVAILABILITY = 'EMERGENCY_STOP', 'AVAILABILITY'
 
@@ -90,6 +93,7 @@ class MtConnect:
     def __init__(self, address: str) -> None:
         """Read the device file; raises UserError."""
         self._file = load_mtconnect(address)
+        self._axes = {axis.name: axis for axis in self._file.axes}
         self._host = HostClock()
         self._agent: Agent | None = None
 
@@ -100,6 +104,7 @@ class MtConnect:
         self._device = DeviceClock()
         self._joiner = Joiner(file.axes, file.together)
         self._under_way, self._round_trip = Recent(), Recent()
+        # Id of a data item to what was last said of it.
         self._states: dict[str, str] = {}
         self._lost = 0
         self._lost_at = -math.inf
@@ -139,12 +144,14 @@ class MtConnect:
         """What is wrong while the connection stands, in one line; '' where all is well."""
         if self._agent is None:
             return ''
-        if self._states.get(_AVAILABILITY) == UNAVAILABLE:
+        if not self._states:
+            return ''  # Not asked yet.
+        if UNAVAILABLE in self._said(_AVAILABILITY):
             return 'the agent has no connection to the controller; look at its adapter'
-        if self._states.get(_ESTOP) == 'TRIGGERED':
+        if self._estop() == 'on':
             return 'E-stop is on; release it and run the cycle again'
         if unknown := self._joiner.unknown:
-            said = self._states.get(unknown[0], 'nothing')
+            said = ''.join(self._said(unknown[0])) or 'nothing'
             return (
                 f'axis {", ".join(unknown)}: the agent says {said}, so there is no feedback; look '
                 'at its adapter'
@@ -173,12 +180,22 @@ class MtConnect:
             return {}
         offset = self._device.offset
         return {
-            'estop': 'on' if self._states.get(_ESTOP) == 'TRIGGERED' else 'off',
+            'estop': self._estop(),
             'clock_offset_ms': '' if offset is None else f'{offset * 1e-6:.1f}',
             'under_way_ms': f'{self._under_way.largest * 1e-6:.1f}',
             'skew_ms': f'{self._joiner.skew.largest * 1e-6:.1f}',
             'lost': str(self._lost),
         }
+
+    def _said(self, name: str) -> list[str]:
+        """Of the data items of a type, or of the one of an axis; without those never heard of."""
+        items = (item for item, one in self._names.items() if one == name)
+        return [self._states[item] for item in items if item in self._states]
+
+    def _estop(self) -> str:
+        """On where any E-stop of the machine is triggered, off where all are armed."""
+        said = set(self._said(_ESTOP))
+        return 'on' if 'TRIGGERED' in said else 'off' if said == {'ARMED'} else 'unknown'
 
     def _ask(self, agent: Agent) -> list[Sample]:
         """What is new, or everything where nothing is known or something was lost."""
@@ -204,6 +221,11 @@ class MtConnect:
         self._check(header)
         if header.first > self._from:
             self._lose(header.first - self._from)
+        if header.next < self._from or header.next == self._from <= header.last:
+            raise DocumentError(
+                f'the MTConnect agent at {self._file.url} has observations up to {header.last} '
+                f'but says that {header.next} is the next after {self._from}; start it again'
+            )
         self._from = header.next
         samples = self._samples(observations, arrival, True)
         if header.next <= header.last:
@@ -216,7 +238,7 @@ class MtConnect:
     ) -> list[Sample]:
         """The positions among them; `stamped` where their stamps say when they were so."""
         for one in observations:
-            self._states[self._names.get(one.item, '')] = one.text[:40]
+            self._states[one.item] = one.text[:40]
         letters = self._joiner.names
         wanted = [one for one in observations if self._names.get(one.item) in letters]
         stamps = [arrival] * len(wanted)
@@ -225,21 +247,47 @@ class MtConnect:
             self._under_way.add(arrival - min(sources))
             stamps = sources if self._file.source_stamps else stamps
         return [
-            Sample(stamp, self._names[one.item], one.number)
+            Sample(stamp, self._names[one.item], self._position(one))
             for stamp, one in zip(stamps, wanted, strict=True)
         ]
 
+    def _position(self, one: Observation) -> float | None:
+        """None where it is no number or cannot be a position."""
+        axis = self._axes[self._names[one.item]]
+        known = one.number is not None and axis.plausible(one.number)
+        return one.number if known else None
+
     def _probe(self, agent: Agent) -> None:
-        """Find the data items, and hold the device file to their units."""
-        self._header, devices = parse_devices(agent.get(self._path('probe', filtered=False)))
-        items = max(devices, key=lambda items: len(self._found(items)), default={})
-        found = self._found(items)
+        """Find the data items, and hold the device file to what they are."""
+        path = self._path('probe', filtered=False)
+        self._header, devices = parse_devices(agent.get(path, _PROBE_S))
+        counts = [len(self._found(items)) for items in devices]
+        if counts.count(len(self._file.axes)) > 1:
+            raise ConnectionError(
+                f'the agent at {self._file.url} has several devices with these items; set device '
+                'in the device file'
+            )
+        items = devices[counts.index(max(counts))] if devices else {}
+        found = {}
         for axis in self._file.axes:
-            item = found.get(axis.name)
-            if item is None:
+            where = f'axes: {axis.name}: item {axis.source!r}'
+            twins = self._found(items).get(axis.name)
+            if twins is None:
                 raise ConnectionError(
-                    f'axes: {axis.name}: item {axis.source!r}: the agent at {self._file.url} has '
-                    'no device with it and the others; correct the device file'
+                    f'{where}: the agent at {self._file.url} has no device with it and the '
+                    'others; correct the device file'
+                )
+            found[axis.name] = item = twins[0]
+            if len(twins) > 1:
+                ids = ', '.join(one.id for one in twins)
+                raise ConnectionError(
+                    f'{where}: the agent has {len(twins)} items of this name; give the id of one '
+                    f'in the device file: {ids}'
+                )
+            if item.subtype not in ('', 'ACTUAL'):
+                raise ConnectionError(
+                    f'{where}: its subType is {item.subtype}; give the item with subType ACTUAL '
+                    'in the device file'
                 )
             if item.units and UNIT_WORDS.get(item.units) != axis.unit:
                 raise ConnectionError(
@@ -250,10 +298,16 @@ class MtConnect:
         self._names |= {item.id: item.type for item in items.values()
                         if item.type in (_ESTOP, _AVAILABILITY)}
 
-    def _found(self, items: dict[str, Item]) -> dict[str, Item]:
-        """Axes to their data items, of those of one device; by id or by name."""
-        known = {key: item for item in items.values() for key in (item.name, item.id)}
-        return {a.name: known[a.source] for a in self._file.axes if a.source in known}
+    def _found(self, items: dict[str, Item]) -> dict[str, list[Item]]:
+        """Axes to the data items of one device that have its id, or else its name."""
+        found = {}
+        for axis in self._file.axes:
+            named = [item for item in items.values() if item.name == axis.source]
+            if one := items.get(axis.source):
+                named = [one]
+            if named:
+                found[axis.name] = named
+        return found
 
     def _path(self, request: str, query: str = '', filtered: bool = True) -> str:
         if filtered:

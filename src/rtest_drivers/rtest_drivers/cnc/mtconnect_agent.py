@@ -3,12 +3,38 @@
 from __future__ import annotations
 
 import http.client
-from urllib.parse import urlsplit
+import math
+import socket
+import time
+from typing import Any
 
+from rtest_drivers.addresses import split_url
 from rtest_drivers.cnc.mtconnect_xml import LARGEST, DocumentError
 from rtest_estimation.errors import UserError
 
 _REPLY_S = 0.8
+
+
+class _Socket(socket.socket):
+    """One that receives nothing after a moment: the time-out of a socket is for every byte anew.
+
+    until : on time.monotonic
+    """
+
+    until = math.inf
+
+    def recv_into(self, *args: Any) -> int:
+        left = self.until - time.monotonic()
+        if left <= 0.0:
+            raise TimeoutError('the answer was not complete in time')
+        self.settimeout(left)
+        return super().recv_into(*args)
+
+
+class _Connection(http.client.HTTPConnection):
+    def connect(self) -> None:
+        super().connect()
+        self.sock = _Socket(fileno=self.sock.detach())
 
 
 class Agent:
@@ -17,20 +43,22 @@ class Agent:
     def __init__(self, url: str) -> None:
         """Raises UserError where `url` is not one of an agent."""
         self.url = url
-        parts = urlsplit(url)
-        try:
-            good = parts.scheme == 'http' and parts.hostname and not parts.query
-            port = parts.port or 80
-        except ValueError:
-            good = False
-        if not good:
+        parts = split_url(url)
+        if parts is None or parts.scheme != 'http' or parts.query:
             raise UserError(f'url: expected http://HOST:PORT of an MTConnect agent, got {url!r}')
         self._base = parts.path.rstrip('/')
-        self._connection = http.client.HTTPConnection(parts.hostname, port, timeout=_REPLY_S)
+        self._connection = _Connection(parts.hostname, parts.port or 80, timeout=_REPLY_S)
 
-    def get(self, path: str) -> bytes:
-        """The document at `path`, also one that says an error; raises ConnectionError."""
+    def get(self, path: str, limit: float = _REPLY_S) -> bytes:
+        """The document at `path`, also one that says an error, whole within `limit` [s].
+
+        Raises ConnectionError.
+        """
         try:
+            if self._connection.sock is None:
+                self._connection.connect()
+            self._connection.sock.settimeout(_REPLY_S)
+            self._connection.sock.until = time.monotonic() + limit
             self._connection.request('GET', f'{self._base}/{path}', headers={'Accept': 'text/xml'})
             answer = self._connection.getresponse()
             body = answer.read(LARGEST + 1)

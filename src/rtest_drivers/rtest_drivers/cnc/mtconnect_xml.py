@@ -17,9 +17,11 @@ LARGEST = 8_000_000
 UNIT_WORDS = {'MILLIMETER': 'mm', 'DEGREE': 'deg', 'INCH': 'inch', 'METER': 'm', 'RADIAN': 'rad'}
 UNAVAILABLE = 'UNAVAILABLE'
 _TIME = re.compile(
-    r'(\d{4})-(\d\d)-(\d\d)T(\d\d):(\d\d):(\d\d)(?:\.(\d{1,9})\d*)?(?:Z|([+-])(\d\d):?(\d\d))?'
+    r'(\d{4})-(\d\d)-(\d\d)T(\d\d):(\d\d):(\d\d)(?:\.(\d{1,9})\d*)?(?:Z|([+-])(\d\d):?(\d\d))?',
+    re.ASCII,
 )
-_NUMBER = re.compile(r'[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?')
+_NUMBER = re.compile(r'[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?', re.ASCII)
+_ITEM_KEYS = ('id', 'name', 'type', 'units', 'subType')
 _EPOCH = datetime(1970, 1, 1, tzinfo=timezone.utc)
 
 
@@ -49,12 +51,13 @@ class Header:
 
 @dataclass(frozen=True)
 class Item:
-    """A data item of a device, as /probe tells it; units are '' where it has none."""
+    """A data item of a device, as /probe tells it; units and subtype are '' where it has none."""
 
     id: str
     name: str
     type: str
     units: str
+    subtype: str
 
 
 @dataclass(frozen=True)
@@ -78,7 +81,7 @@ def parse_devices(body: bytes) -> tuple[Header, list[dict[str, Item]]]:
     for device in root.iter():
         if _tag(device) == 'Device':
             items = [
-                Item(*(one.get(key, '') for key in ('id', 'name', 'type', 'units')))
+                Item(*(one.get(key, '') for key in _ITEM_KEYS))
                 for one in device.iter() if _tag(one) == 'DataItem'
             ]
             devices.append({item.id: item for item in items})
@@ -105,11 +108,11 @@ def parse_time(text: str) -> int:
     *date, decimals, sign, hours, minutes = match.groups()
     try:
         time = datetime(*map(int, date), tzinfo=timezone.utc)
-    except ValueError:
+        if sign:
+            zone = timedelta(hours=int(hours), minutes=int(minutes))
+            time -= zone if sign == '+' else -zone
+    except (ValueError, OverflowError):  # In the year 0 or 10000.
         raise DocumentError(f'the agent says {text[:40]!r} for a time') from None
-    if sign:
-        zone = timedelta(hours=int(hours), minutes=int(minutes))
-        time -= zone if sign == '+' else -zone
     return (time - _EPOCH) // timedelta(seconds=1) * 10**9 + int((decimals or '').ljust(9, '0'))
 
 
@@ -148,7 +151,7 @@ def _header(root: ElementTree.Element) -> Header:
 
 
 def _whole(text: str) -> int:
-    if not re.fullmatch(r'\d{1,20}', text):
+    if not re.fullmatch(r'[0-9]{1,20}', text):
         raise DocumentError(f'the agent says {text[:40]!r} for a sequence number')
     return int(text)
 

@@ -31,19 +31,27 @@ from dataclasses import dataclass
 from datetime import datetime, timedelta, timezone
 from typing import Any
 
+from rtest_drivers.addresses import split_url
 from rtest_drivers.clock import HostClock
 from rtest_drivers.cnc.axes import AxisSource
 from rtest_drivers.cnc.clock import DeviceClock, Recent
 from rtest_drivers.cnc.device_file import DeviceReader, load
 from rtest_drivers.cnc.join import Joiner, Sample
 from rtest_drivers.cnc.opcua_link import Batch, Link, LinkSettings
+from rtest_estimation.errors import UserError
 from rtest_estimation.records import Feedback
 
 STAMPS = ('source', 'arrival')
+# Of security: OPC 10000-7, as asyncua knows them.
+POLICIES = (
+    'Basic256Sha256', 'Aes128Sha256RsaOaep', 'Aes256Sha256RsaPss', 'Basic256', 'Basic128Rsa15',
+)
+MODES = ('Sign', 'SignAndEncrypt')
 _KEYS = {
     'url', 'user', 'password', 'security', 'period_ms', 'stamp', 'skew_ms', 'axes', 'estop',
 }
 _ESTOP = 'estop'
+_ESTOP_WORDS = {True: 'on', False: 'off', None: 'unknown'}
 _EPOCH = datetime(1970, 1, 1, tzinfo=timezone.utc)
 
 
@@ -60,7 +68,7 @@ class OpcUaFile:
     axes: tuple[AxisSource, ...]
     source_stamps: bool
     together: int
-    estop: Any = None
+    estop: bool | float | str | None = None
 
 
 def load_opcua(path: str) -> OpcUaFile:
@@ -72,10 +80,26 @@ def load_opcua(path: str) -> OpcUaFile:
     if 'estop' in reader.data:
         section = reader.section('estop', {'node', 'value'})
         estop = section.required('value')
+        if not isinstance(estop, bool | int | float | str):
+            raise UserError(
+                f'{section.where}: value: expected true, false, a number or a text, got {estop!r}'
+            )
         nodes[_ESTOP] = DeviceReader(section.where, section.data).text('node')
+    url, security = reader.text('url'), reader.text('security', '')
+    parts = split_url(url)
+    if parts is None or parts.scheme != 'opc.tcp' or parts.port is None:
+        raise UserError(f'{path}: url: expected opc.tcp://HOST:PORT, got {url!r}')
+    words = security.split(',')
+    if security and (
+        len(words) < 4 or words[0] not in POLICIES or words[1] not in MODES or not all(words)
+    ):
+        raise UserError(
+            f'{path}: security: expected POLICY,MODE,CERTIFICATE,KEY with a policy of '
+            f'{list(POLICIES)} and a mode of {list(MODES)}, got {security!r}'
+        )
     link = LinkSettings(
-        reader.text('url'), reader.text('user', ''), reader.text('password', ''),
-        reader.text('security', ''), nodes, reader.number('period_ms', 20.0, (1.0, 1000.0)) * 1e-3,
+        url, reader.text('user', ''), reader.text('password', ''),
+        security, nodes, reader.number('period_ms', 20.0, (1.0, 1000.0)) * 1e-3,
     )
     return OpcUaFile(
         link, axes, reader.choice('stamp', STAMPS) == 'source',
@@ -83,16 +107,38 @@ def load_opcua(path: str) -> OpcUaFile:
     )
 
 
-def position(value: Any) -> tuple[float | None, str]:
-    """A DataValue's number; None with the reason where it is not good or no finite number."""
+def position(value: Any, axis: AxisSource) -> tuple[float | None, str]:
+    """A DataValue's number; None with the reason where it is not good or no position."""
+    said, why = _good(value)
+    if why:
+        return None, why
+    if isinstance(said, bool) or not isinstance(said, int | float):
+        return None, f'{type(said).__name__} instead of a number'
+    if not axis.plausible(said):
+        return None, f'{said:g} {axis.unit}' if math.isfinite(said) else 'not finite'
+    return float(said), ''
+
+
+def estop_state(value: Any, on: bool | float | str) -> tuple[bool | None, str]:
+    """Whether a DataValue means E-stop; None with the reason where that is not known.
+
+    on : the value that means it
+    """
+    said, why = _good(value)
+    if why:
+        return None, why
+    kinds = str if isinstance(on, str) else (bool, int, float)
+    if not isinstance(said, kinds):
+        return None, f'{type(said).__name__} {said!r:.40} is never {on!r}'
+    return said == on, ''
+
+
+def _good(value: Any) -> tuple[Any, str]:
+    """What a DataValue says; None with the reason where it is not good or says nothing."""
     if not value.StatusCode.is_good():
         return None, value.StatusCode.name
-    number = value.Value.Value
-    if isinstance(number, bool) or not isinstance(number, int | float):
-        return None, f'{type(number).__name__} instead of a number'
-    if not math.isfinite(number):
-        return None, 'not finite'
-    return float(number), ''
+    said = None if value.Value is None else value.Value.Value
+    return said, '' if said is not None else 'no value'
 
 
 def source_time(value: Any) -> int | None:
@@ -111,6 +157,7 @@ class OpcUa:
     def __init__(self, address: str) -> None:
         """Read the device file; raises UserError."""
         self._file = load_opcua(address)
+        self._axes = {axis.name: axis for axis in self._file.axes}
         self._host = HostClock()
         self._link: Link | None = None
 
@@ -122,7 +169,9 @@ class OpcUa:
         self._bad: dict[str, str] = {}
         # Axes whose first value has come: it may have been sampled long before.
         self._seen: set[str] = set()
-        self._estop = self._stampless = False
+        # None: not known.
+        self._estop: bool | None = None
+        self._stampless = False
         self._under_way, self._round_trip = Recent(), Recent()
         link = Link(self._file.link, self._host.now)
         link.start()
@@ -147,10 +196,13 @@ class OpcUa:
             return ''
         if self._estop:
             return 'E-stop is on; release it and run the cycle again'
-        for axis, why in self._bad.copy().items():
+        for name, why in self._bad.copy().items():
+            what, so = f'axis {name}', 'there is no feedback'
+            if name == _ESTOP:
+                what, so = name, 'an E-stop would not be seen'
             return (
-                f'axis {axis}: the controller has no good value ({why}), so there is no feedback; '
-                'look at the node in the server'
+                f'{what}: the controller has no good value ({why}), so {so}; look at the node in '
+                'the server'
             )
         if self._stampless and self._file.source_stamps:
             return 'values come without source time stamps; set stamp: arrival in the device file'
@@ -174,7 +226,7 @@ class OpcUa:
             return {}
         offset = self._device.offset
         return {
-            **({'estop': 'on' if self._estop else 'off'} if self._file.estop is not None else {}),
+            **({'estop': _ESTOP_WORDS[self._estop]} if self._file.estop is not None else {}),
             'clock_offset_ms': '' if offset is None else f'{offset * 1e-6:.1f}',
             'under_way_ms': f'{self._under_way.largest * 1e-6:.1f}',
             'skew_ms': f'{self._joiner.skew.largest * 1e-6:.1f}',
@@ -189,14 +241,14 @@ class OpcUa:
         stamps = self._stamps(batch)
         for (name, value), stamp in zip(batch.values, stamps, strict=True):
             if name == _ESTOP:
-                self._estop = value.Value.Value == self._file.estop
-                continue
-            number, why = position(value)
-            if number is None:
+                self._estop, why = estop_state(value, self._file.estop)
+            else:
+                number, why = position(value, self._axes[name])
+                samples.append(Sample(stamp, name, number))
+            if why:
                 self._bad[name] = why
             else:
                 self._bad.pop(name, None)
-            samples.append(Sample(stamp, name, number))
         return samples
 
     def _stamps(self, batch: Batch) -> list[int]:
@@ -204,8 +256,11 @@ class OpcUa:
         stamps = [batch.stamp] * len(batch.values)
         sources = {}
         for at, (name, value) in enumerate(batch.values):
+            if name == _ESTOP:
+                continue
             source = source_time(value)
-            self._stampless = self._stampless or source is None
+            # A value that is none needs no time.
+            self._stampless |= source is None and not _good(value)[1]
             if source is not None and name in self._seen:
                 sources[at] = source
             self._seen.add(name)

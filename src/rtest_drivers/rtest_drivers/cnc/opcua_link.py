@@ -7,19 +7,25 @@ import contextlib
 import logging
 import queue
 import threading
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 # Time for an answer; a server that is silent for longer is lost.
-_REQUEST_S = 0.8
+_REQUEST_S = 0.7
+# A subscription of which nothing comes for its keep-alive interval and this is dead.
+_SILENT_S = 0.6
+# Longest time from one question after the server's state to the next.
+_ASK_S = 0.1
 _CONNECT_S = 5.0
 # Batches that wait for the driver; more are thrown away.
 _WAITING = 1000
 # Values of one node that the server keeps until it publishes.
 _KEPT = 100
-# Server_ServerStatus_State (OPC 10000-6, annex A).
-_STATE = 'i=2259'
+# Server_ServerStatus_State (OPC 10000-6, annex A) and its value while a server does its work
+# (ServerState, OPC 10000-5).
+_STATE, _RUNNING = 'i=2259', 0
 
 
 class LinkError(ConnectionError):
@@ -59,9 +65,11 @@ class LinkSettings:
 class Link:
     """The connection, until it is stopped or lost; not to be started again.
 
-    The server tells changes only. While there are none, its state is read in the same period: the
-    answer shows that it lives, and that what it had sampled one publishing interval before the
-    question has been told.
+    The server tells changes only, and that there are none by empty messages, keep-alives, which
+    are asked for after every publishing interval. Its state is read in the same period: what it
+    had sampled one publishing interval before the question has been told before the answer,
+    provided that the subscription lives. That is known as soon as anything of the subscription
+    comes after the answer; only then is the answer a sign of life.
     """
 
     def __init__(self, settings: LinkSettings, now: Callable[[], int]) -> None:
@@ -111,8 +119,12 @@ class Link:
             asyncio.run(self._run())
         except BaseException as error:
             self._failure = error
+        self._wake()
+
+    def _wake(self) -> None:
+        """Who waits, for the connection or for values."""
         self._ready.set()
-        self._put(None)  # Wakes who waits.
+        self._put(None)
 
     async def _run(self) -> None:
         from asyncua import Client
@@ -138,29 +150,60 @@ class Link:
         try:
             await self._follow(client)
         except wrong as error:
-            if isinstance(error, LinkError):
-                raise
-            raise ConnectionError(
+            # Told before saying goodbye, for which a frozen server takes its time.
+            self._failure = error if isinstance(error, LinkError) else ConnectionError(
                 f'lost {where} ({_text(error)}); look whether the controller and the network run'
-            ) from None
+            )
+            self._wake()
         finally:
             with contextlib.suppress(*wrong):  # It may have gone already.
                 await asyncio.wait_for(client.disconnect(), _CONNECT_S)
 
     async def _follow(self, client: Any) -> None:
-        settings = self._settings
-        subscription = await client.create_subscription(settings.period * 1e3, self)
+        from asyncua import ua
+        from asyncua.common.subscription import Subscription
+
+        settings, state = self._settings, client.get_node(_STATE)
+        # Not by the client, which asks for keep-alives every 45 minutes.
+        parameters = ua.CreateSubscriptionParameters(
+            RequestedPublishingInterval=settings.period * 1e3,
+            RequestedLifetimeCount=10_000,
+            RequestedMaxKeepAliveCount=1,
+            MaxNotificationsPerPublish=10_000,
+            PublishingEnabled=True,
+        )
+        subscription = Subscription(state.session, parameters, self)
+        revised = await subscription.init()
         for name, node in settings.nodes.items():
             await self._subscribe(client, subscription, name, node)
-        # As the server has revised it [ns].
-        behind = round(subscription.parameters.RequestedPublishingInterval * 1e6)
+        behind = round(revised.RevisedPublishingInterval * 1e6)
+        silence = _SILENT_S + (
+            revised.RevisedPublishingInterval * 1e-3 * revised.RevisedMaxKeepAliveCount
+        )
+        begun = time.monotonic()
+        answers: list[tuple[float, Batch]] = []
         self._ready.set()
         while not self._stop.is_set():
             asked = self._now()
-            await client.get_node(_STATE).read_value()
-            self._put(Batch(asked - behind, round_trip=self._now() - asked))
+            if (said := await state.read_value()) != _RUNNING:
+                raise LinkError(
+                    f'OPC UA server {settings.url} is not running, its state is {said}; look at '
+                    'the controller'
+                )
+            now = time.monotonic()
+            answers.append((now, Batch(asked - behind, round_trip=self._now() - asked)))
+            published = subscription.last_publish_at or begun
+            if now - published > silence:
+                raise LinkError(
+                    f'OPC UA server {settings.url} answers, but of the subscription nothing has '
+                    f'come for {now - published:.1f} s; it is made anew, start the server again '
+                    'if that does not help'
+                )
+            for _, batch in (one for one in answers if one[0] < published):
+                self._put(batch)
+            answers = [one for one in answers if one[0] >= published]
             try:
-                await asyncio.wait_for(self._stop.wait(), settings.period)
+                await asyncio.wait_for(self._stop.wait(), min(settings.period, _ASK_S))
             except asyncio.TimeoutError:
                 continue
 
@@ -195,6 +238,7 @@ class Link:
             f'OPC UA server {self._settings.url} ended the subscription '
             f'({notification.Status.name}); look whether it was stopped'
         )
+        self._wake()
         self._stop.set()
 
     def _flush(self) -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 from rtest_drivers.cnc.linuxcnc import load_linuxcnc
 from rtest_drivers.cnc.linuxcnc_control import Control
 from rtest_estimation.errors import UserError
+from rtest_identification.plans import program_name
 
 # As `rtest plan` ends them.
 _ENDINGS = ('.ngc', '.nc')
@@ -16,7 +17,7 @@ _FIRST_STOP_S = 10.0
 
 def program_of(cycle: str, folder: Path) -> Path | None:
     """The program of a cycle in the folder of its session file; None where there is none."""
-    paths = (folder / f'{cycle}{ending}' for ending in _ENDINGS)
+    paths = (folder / f'{program_name(cycle)}{ending}' for ending in _ENDINGS)
     return next((path for path in paths if path.is_file()), None)
 
 

@@ -23,16 +23,32 @@ if TYPE_CHECKING:
 
 HELP = 'change commands so that the predicted error of a machine vanishes'
 CONTROLLERS = ('linuxcnc', 'iso')
+# Of the tool on the part [mm/min].
+_FEED = 1000.0
 
 
 @dataclass
 class _Made:
-    """Corrections by name, the files of them, notes, and places for the table."""
+    """Corrections by name, the files of them, notes, and places for the table.
+
+    beyond : axes that leave their range
+    """
 
     corrections: dict[str, Correction] = field(default_factory=dict)
     texts: dict[str, str] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
     places: list[tuple[float, ...]] = field(default_factory=list)
+    beyond: set[str] = field(default_factory=set)
+
+    def check_range(self, correction: Correction, name: str = '') -> None:
+        """Note which axes leave their range. name : of the cycle, before each note."""
+        from rtest_identification.frustum.commands import out_of_range
+
+        anyway = out_of_range(correction.machine, correction.nominal)
+        for axis, note in out_of_range(correction.machine, correction.positions).items():
+            why = '' if axis in anyway else '; it is the correction that takes it there'
+            self.notes.append(f'{name}{note}{why}')
+            self.beyond.add(axis)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -57,9 +73,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         metavar=('X', 'Y', 'Z'),
                         help='place for the table, table frame, mm; may be repeated (default: '
                         'the spheres of --plan, else a cube of 200 mm)')
-    parser.add_argument('--controller', choices=CONTROLLERS, default='linuxcnc',
+    parser.add_argument('--controller', choices=CONTROLLERS,
                         help='dialect of new NC programs (default: linuxcnc)')
-    parser.add_argument('--feed', type=float, default=1000.0, metavar='MM/MIN',
+    parser.add_argument('--feed', type=float, metavar='MM/MIN',
                         help='of the tool on the part, for a --path as CSV (default: 1000)')
     parser.add_argument('--out', type=Path, metavar='DIR',
                         help='write to DIR, which must not hold anything yet (default: '
@@ -95,7 +111,7 @@ def run(arguments: argparse.Namespace) -> int:
         still = np.zeros_like(one.nominal)
         change = compensation.changes(known.machine, tables, one.nominal, still)
         errors = known.at(one.nominal, still)
-        alone[name] = output.judge(known, judged(known.machine, one.nominal, change, errors))
+        alone[name] = judged(known.machine, one.nominal, change, errors)
     notes = [*known.notes, *made.notes]
     if grid.left_out:
         notes.append(
@@ -103,9 +119,13 @@ def run(arguments: argparse.Namespace) -> int:
             'stations are out of reach or not measured'
         )
     with writing(out):
-        data = output.as_dict(known, sums, tables, refused, elsewhere, alone, notes)
+        data = output.as_dict(
+            known, sums, tables, refused, elsewhere,
+            {name: output.judge(known, one) for name, one in alone.items()}, notes,
+        )
         path = output.write_all(out, data, made.texts, tables)
-    total = output.judge(known, join(list(made.corrections.values()) or [grid.correction]))
+    parts = list(made.corrections) or ['table']
+    total = output.judge(known, join([whole[part] for part in parts]))
     lines = [*(f'note: {note}' for note in notes), *output.told(total)]
     lines += [
         f'{one.axis.name}.comp: the own error of {one.axis.name}, for LinuxCNC' for one in tables
@@ -116,12 +136,22 @@ def run(arguments: argparse.Namespace) -> int:
             f'in no compensation file: {", ".join(elsewhere)}: they act across their own axis, '
             'which takes several axes at once'
         )
-    if tables:
-        lines.append(output.summary('work volume, compensation files alone', alone['table']))
-    print('\n'.join(f'  {line}' for line in lines))
     what = arguments.path or arguments.plan
     name = what.name if what else 'work volume'
-    print(f'{output.summary(name, total)} -> {shown(path.absolute())}', flush=True)
+    counted = 'points along its way' if arguments.path else 'poses'
+    if tables:
+        files = output.judge(known, join([alone[part] for part in parts]))
+        lines.append(output.summary(f'{name}, compensation files alone', files, counted))
+        if files.after.shift > files.before.shift:
+            lines.append(
+                'warning: the compensation files alone make it worse here: they take away what '
+                'makes up for a part of the rest'
+            )
+    print('\n'.join(f'  {line}' for line in lines))
+    axes = ', '.join(sorted(made.beyond))
+    beyond = f'; the machine cannot run it, out of range: {axes}' if axes else ''
+    print(f'{output.summary(name, total, counted)}{beyond} -> {shown(path.absolute())}',
+          flush=True)
     return 0
 
 
@@ -131,7 +161,12 @@ def _check(arguments: argparse.Namespace) -> None:
         raise UserError('--effects: give the --model that has them')
     if arguments.plan and arguments.machine:
         raise UserError('--machine: the session file of --plan names the machine')
-    if not 0.0 < arguments.feed < math.inf:
+    table = arguments.path and arguments.path.suffix.lower() == '.csv'
+    if arguments.feed is not None and not table:
+        raise UserError('--feed: is of a --path as CSV; a program has its own')
+    if arguments.controller and not (table or arguments.plan):
+        raise UserError('--controller: is of new programs, for a --plan or a --path as CSV')
+    if arguments.feed is not None and not 0.0 < arguments.feed < math.inf:
         raise UserError(f'--feed {arguments.feed:g}: expected a positive number of mm/min')
     if not all(math.isfinite(value) for row in arguments.at for value in row):
         raise UserError('--at: expected three finite numbers of mm')
@@ -158,7 +193,7 @@ def _corrected(arguments: argparse.Namespace) -> tuple[KnownErrors, _Made]:
             more = load_effects(arguments.effects, machine)
         known = of_model(load_model(arguments.model), machine, more)
     if config:
-        return known, _session(config, known, arguments.controller)
+        return known, _session(config, known, arguments.controller or CONTROLLERS[0])
     if arguments.path:
         return known, _path(arguments, known)
     return known, _Made()
@@ -169,7 +204,6 @@ def _session(config: SessionConfig, known: KnownErrors, controller: str) -> _Mad
     from rtest_estimation.records import Kind
     from rtest_identification.correction.output import positions_text
     from rtest_identification.correction.session import correct_plan, plan_program
-    from rtest_identification.frustum.commands import out_of_range
     from rtest_identification.nc_program import NcSettings
 
     made = _Made()
@@ -179,8 +213,7 @@ def _session(config: SessionConfig, known: KnownErrors, controller: str) -> _Mad
         if plan.kind is Kind.STATIC:
             made.corrections[plan.cycle] = correction
             made.places.append(tuple(plan.sphere))
-        made.notes += [f'{plan.cycle}: {note}'
-                       for note in out_of_range(config.machine, correction.positions)]
+        made.check_range(correction, f'{plan.cycle}: ')
         made.texts[f'{corrected.cycle}.csv'] = positions_text(correction)
         made.texts[f'{corrected.cycle}{suffix}'] = plan_program(
             config, corrected, NcSettings(controller), number
@@ -191,30 +224,27 @@ def _session(config: SessionConfig, known: KnownErrors, controller: str) -> _Mad
 def _path(arguments: argparse.Namespace, known: KnownErrors) -> _Made:
     from rtest_identification.correction import program
     from rtest_identification.correction.output import positions_text
-    from rtest_identification.correction.step import correct
-    from rtest_identification.frustum.commands import out_of_range
+    from rtest_identification.correction.step import join
     from rtest_identification.frustum.path_file import load_path
 
     path, made = arguments.path, _Made()
     if path.suffix.lower() == '.csv':
         commands = load_path(path, known.machine, inside=known.inside)
-        errors = known.at(commands.positions, commands.approach)
-        correction = correct(known.machine, commands.positions, errors)
-        suffix = '.nc' if arguments.controller == 'iso' else '.ngc'
-        name = f'{path.stem}-corrected{suffix}'
-        made.texts[name] = program.path_program(
-            commands, correction, arguments.feed / 6e4, arguments.controller
+        controller = arguments.controller or CONTROLLERS[0]
+        suffix = '.nc' if controller == 'iso' else '.ngc'
+        found = program.path_program(
+            commands, known, (arguments.feed or _FEED) / 6e4, controller
         )
     else:
         try:
             text = path.read_text(encoding='utf-8-sig')
         except (OSError, UnicodeDecodeError) as error:
             raise UserError(f'{path}: cannot read the program: {error}') from None
-        rewritten = program.rewrite(path, text, known)
-        correction = rewritten.correction
-        made.notes += rewritten.notes
-        made.texts[f'{path.stem}-corrected{path.suffix}'] = rewritten.text
-    made.corrections[path.name] = correction
-    made.notes += out_of_range(known.machine, correction.positions)
-    made.texts[f'{path.stem}-corrected.csv'] = positions_text(correction)
+        suffix = path.suffix
+        found = program.rewrite(path, text, known)
+    made.notes += found.notes
+    made.texts[f'{path.stem}-corrected{suffix}'] = found.text
+    made.corrections[path.name] = found.along
+    made.check_range(join([found.correction, found.along]))
+    made.texts[f'{path.stem}-corrected.csv'] = positions_text(found.correction)
     return made

@@ -25,6 +25,9 @@ HELP = 'predict the cone frustum test or another feature from the errors of a ma
 # Table 6-1, case (a).
 _PHI, _PSI, _DIAMETER, _CENTRE = 15.0, 30.0, 129.9, (-81.8, 0.0, 189.3)
 
+# No part is further away or wider [mm].
+_FARTHEST = 1e5
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of `rtest frustum`."""
@@ -47,10 +50,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                       help='points of the tool path (default: 360)')
     parser.add_argument('--feed', type=float, default=1000.0, metavar='MM/MIN',
                         help='of the tool on the part (default: 1000)')
-    parser.add_argument('--solution', choices=('auto', 'negative', 'positive'), default='auto',
+    parser.add_argument('--solution', choices=('auto', 'negative', 'positive'),
                         help='sign of the rotary axis nearest to the tool where the path starts; '
-                        'auto: negative where the ranges of the axes and the measured stations '
-                        'allow it')
+                        'auto (default): negative where the ranges of the axes and the measured '
+                        'stations allow it')
     known = parser.add_mutually_exclusive_group()
     known.add_argument('--identification', type=Path, metavar='FILE',
                        help='identification.json of the machine')
@@ -60,13 +63,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--path', type=Path, metavar='FILE',
                         help='a feature of your own instead of the cone: CSV (tool tip and axis, '
                         'or positions of the axes) or an NC program of axis positions (G0, G1)')
-    parser.add_argument('--surface', choices=('left', 'right', 'floor'), default='left',
+    parser.add_argument('--surface', choices=('left', 'right', 'floor'),
                         help='where the surface is that --path cuts: left or right of the travel, '
                         'or under the tool (default: left)')
     parser.add_argument('--tables', action='store_true',
                         help='Tables 6-2 to 6-7 of the thesis, printed and computed')
     parser.add_argument('--out', type=Path, metavar='DIR',
-                        help='write to DIR (default: out/frustum-DATE-TIME)')
+                        help='write to DIR, which must not hold anything yet (default: '
+                        'out/frustum-DATE-TIME)')
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -80,6 +84,8 @@ def run(arguments: argparse.Namespace) -> int:
     _check(arguments)
     out = arguments.out or Path('out') / session_name('frustum')
     check_folder(out)
+    if out.is_dir() and any(out.iterdir()):
+        raise UserError(f'{out}: is not empty; choose another --out')
     machine = load_machine(arguments.machine or config_path('nmv1500dcg.yaml'))
     with writing(out):
         summary = _tables(machine, arguments, out) if arguments.tables else (
@@ -99,9 +105,11 @@ def _check(arguments: argparse.Namespace) -> None:
     ]
     if arguments.path and cone:
         raise UserError(f'{cone[0]} is of the cone, --path is another feature: give one of them')
+    if arguments.surface and not arguments.path:
+        raise UserError('--surface is of a --path, the cone has its own')
     if arguments.tables:
         others = [
-            f'--{name}' for name in ('machine', 'identification', 'model', 'path')
+            f'--{name}' for name in ('machine', 'identification', 'model', 'path', 'solution')
             if getattr(arguments, name)
         ]
         if cone + others:
@@ -176,18 +184,18 @@ def _feature(machine: Machine, arguments: argparse.Namespace, out: Path) -> str:
 def _commands(
     machine: Machine, arguments: argparse.Namespace, field: ErrorField | None
 ) -> tuple[Commands, Frustum | None]:
-    from rtest_identification.frustum.commands import command
+    from rtest_identification.frustum.commands import AUTO, command
     from rtest_identification.frustum.cone import POINTS
     from rtest_identification.frustum.path_file import load_path
 
-    choice = {
-        'solution': arguments.solution,
-        'inside': None if field is None else lambda p: field.errors(p, outside='nan').inside,
-    }
+    inside = None if field is None else lambda p: field.errors(p, outside='nan').inside
     if arguments.path:
-        return load_path(arguments.path, machine, arguments.surface, **choice), None
+        return load_path(
+            arguments.path, machine, arguments.surface, arguments.solution, inside
+        ), None
     cone = _cone(arguments)
-    return command(machine, cone.feature(arguments.points or POINTS), **choice), cone
+    feature = cone.feature(arguments.points or POINTS)
+    return command(machine, feature, arguments.solution or AUTO, inside), cone
 
 
 def _cone(arguments: argparse.Namespace) -> Frustum:
@@ -198,8 +206,10 @@ def _cone(arguments: argparse.Namespace) -> Frustum:
         return default if value is None else value
 
     centre = tuple(arguments.centre or _CENTRE)
-    if not all(map(math.isfinite, centre)):
-        raise UserError('--centre: expected three finite numbers of mm')
+    if not all(abs(value) <= _FARTHEST for value in centre):
+        raise UserError(f'--centre: expected three numbers of mm, {_FARTHEST:g} at most')
+    if arguments.diameter is not None and arguments.diameter > _FARTHEST:
+        raise UserError(f'--diameter {arguments.diameter:g}: expected {_FARTHEST:g} mm at most')
     cone = frustum(
         given('phi', _PHI), centre, given('psi', _PSI), given('diameter', _DIAMETER)
     )

@@ -10,6 +10,7 @@ import argparse
 from pathlib import Path
 
 from rtest_drivers.commands.identify import folders, recording_name
+from rtest_drivers.topics import add_topic_argument, chosen_topics
 
 HELP = 'find the effect that a model lacks'
 OUTPUT = 'gap'
@@ -24,6 +25,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         help='effects of your own, beside the library')
     parser.add_argument('--machine', type=Path, metavar='FILE',
                         help='machine file to use instead of the recorded one')
+    add_topic_argument(parser)
     parser.add_argument('--no-report', action='store_true',
                         help='write gap.json and model.yaml only')
     parser.add_argument('--out', type=Path, metavar='DIR',
@@ -51,7 +53,7 @@ def _one(bag: Path, model: object, arguments: argparse.Namespace, out: Path) -> 
     check_folder(out)
     found = gap_recording(
         bag, model, arguments.effects, arguments.machine,
-        lambda line: print(f'  {line}', flush=True),
+        lambda line: print(f'  {line}', flush=True), chosen_topics(arguments.topic),
     )
     for warning in found.warnings:
         print(f'  warning: {warning}')

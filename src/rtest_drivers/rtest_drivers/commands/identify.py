@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from rtest_drivers.topics import add_topic_argument, chosen_topics
 from rtest_estimation.errors import UserError
 
 if TYPE_CHECKING:
@@ -30,6 +31,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('bags', type=Path, nargs='+', metavar='BAG', help='recorded session')
     parser.add_argument('--machine', type=Path, metavar='FILE',
                         help='machine file to use instead of the recorded one')
+    parser.add_argument('--nest', type=Path, metavar='BAG',
+                        help='another recording, whose nest calibrations are used instead of the '
+                        "recording's own; the nest must not have been taken apart in between")
     parser.add_argument('--tolerance', type=Path, metavar='FILE',
                         help='judge every error by the limits of FILE: pass, fail or undecided '
                         '(ISO 14253-1); for example config/tolerance_example.yaml')
@@ -44,9 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         help='effects of your own that the model has')
     parser.add_argument('--out', type=Path, metavar='DIR',
                         help='write to DIR, or to DIR/NAME of each of several recordings')
-    parser.add_argument('--topic', action='append', default=[], metavar='ROLE=NAME',
-                        help='where a recording has several topics of a type: the one that is '
-                        'meant, for example gauges=/cell_2/rtest/gauges; may be given often')
+    add_topic_argument(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -54,8 +56,8 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.trials and arguments.trials < MIN_TRIALS:
         raise UserError(f'--monte-carlo {arguments.trials}: expected {MIN_TRIALS} trials or more')
     options = Options(
-        arguments.machine, _topics(arguments.topic), arguments.tolerance, arguments.priors,
-        arguments.model, arguments.trials, arguments.effects,
+        arguments.machine, chosen_topics(arguments.topic), arguments.tolerance, arguments.priors,
+        arguments.model, arguments.trials, arguments.effects, arguments.nest,
     )
     for bag, out in folders(arguments.bags, arguments.out, OUTPUT):
         identify(bag, out, options)
@@ -88,23 +90,12 @@ def folders(bags: Sequence[Path], out: Path | None, name: str) -> list[tuple[Pat
     return found
 
 
-def _topics(chosen: list[str]) -> dict[str, str]:
-    from rtest_estimation.recording import ROLES
-
-    topics = dict(text.partition('=')[::2] for text in chosen)
-    for role, name in topics.items():
-        if role not in ROLES or not name.startswith('/'):
-            raise UserError(
-                f'--topic {role}={name}: expected ROLE=/NAME with a role of {", ".join(ROLES)}'
-            )
-    return topics
-
-
 @dataclass(frozen=True)
 class Options:
     """How to identify: other files than the recorded ones, and what to do besides.
 
     trials : of a Monte Carlo propagation; 0 for none
+    nest : recording whose nest calibrations are used
     """
 
     machine: Path | None = None
@@ -114,6 +105,7 @@ class Options:
     model: Path | None = None
     trials: int = 0
     effects: Path | None = None
+    nest: Path | None = None
 
 
 def identify(
@@ -140,7 +132,7 @@ def identify(
     name = recording_name(bag)
     result = identify_recording(
         bag, options.machine, lambda line: quiet or print(f'  {line}', flush=True),
-        options.topics, options.priors, options.model, limits, options.effects,
+        options.topics, options.priors, options.model, limits, options.effects, options.nest,
     )
     for line in _missing(result):
         print(f'  missing: {line}')

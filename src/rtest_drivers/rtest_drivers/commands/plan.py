@@ -73,11 +73,15 @@ def run(arguments: argparse.Namespace) -> int:
     out = arguments.out or Path('out') / session_name(f'plan-{source.stem}')
     path = write_plan(checked, out, source.stem, settings, arguments.tcp)
     print('\n'.join(_told(checked)))
-    location = checked.foresight.location
+    seen = checked.foresight
+    determined = ''
+    if seen is not None:
+        determined = (
+            f'{seen.poses} poses, {int(seen.location.determined.sum())} of '
+            f'{len(seen.location.parameters)} errors determined, '
+        )
     print(
-        f'{source.stem}: {config.kind} plan, {checked.foresight.poses} poses, '
-        f'{_time(checked.duration)}, {int(location.determined.sum())} of '
-        f'{len(location.parameters)} errors determined, '
+        f'{source.stem}: {config.kind} plan, {determined}{_time(checked.duration)}, '
         f'{_count(len(checked.warnings), "warning")} -> {shown(path.absolute())}'
     )
     return 0
@@ -85,25 +89,35 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _told(checked: CheckedPlan) -> list[str]:
     """What a person wants to know before measuring."""
+    from rtest_identification.plans import program_name
+
     config, seen = checked.config, checked.foresight
-    stations = ', '.join(
-        f'{name} at {" ".join(f"{math.degrees(v):g}" for v in values)} deg'
-        for name, values in zip(config.machine.rotary, config.stations, strict=True)
-    )
-    lines = [f'{config.machine.name}, {config.kind} cycle: {stations}', '']
+    lines = [f'{config.machine.name}, {config.kind} cycle']
+    if seen is not None:
+        lines[0] += ': ' + ', '.join(
+            f'{name} at {" ".join(f"{math.degrees(v):g}" for v in values)} deg'
+            for name, values in zip(config.machine.rotary, config.stations, strict=True)
+        )
+    lines.append('')
     lines.append(f'{"cycle":20} {"poses":>5} {"blocks":>6} {"time":>9}')
-    for plan, path, check in zip(config.plans, checked.paths, checked.checks, strict=True):
+    for plan, path, check in zip(config.distinct, checked.paths, checked.checks, strict=True):
         near = f'  spindle {check.distance * 1e3:.1f} mm away' if check.distance else ''
         lines.append(
-            f'{plan.cycle:20} {len(plan.commands):5} {len(path.positions):6} '
+            f'{program_name(plan.cycle):20} {len(plan.commands):5} {len(path.positions):6} '
             f'{_time(check.duration):>9}{near}'
         )
-    lines += ['', *_ranges(checked), '']
-    lines += _errors(seen)
-    for one in (seen.outer_map, seen.inner_map):
-        if one is not None:
-            lines += ['', *_map(one)]
-    lines += ['', *_visibility(seen)]
+    if config.every:
+        lines.append(
+            f'the last of them {config.repetitions} times, every {_time(config.every)}; what '
+            'follows is of one cycle'
+        )
+    lines += ['', *_ranges(checked)]
+    if seen is not None:
+        lines += ['', *_errors(seen)]
+        for one in (seen.outer_map, seen.inner_map):
+            if one is not None:
+                lines += ['', *_map(one)]
+        lines += ['', *_visibility(seen)]
     lines += ['', f'not checked: {checked.unchecked}']
     return lines + [f'warning: {text}' for text in checked.warnings] + ['']
 

@@ -137,9 +137,7 @@ def measure(
 
     # Mistakes in the files are told before anything is started.
     config = load_session(settings.config)
-    settings = replace(
-        settings, sphere_radius=config.sphere_radius, devices=config.devices
-    )
+    settings = settings.of(config)
     simulated = settings.simulate is not None
     if simulated:
         _check_truth(settings.simulate, config.plans)
@@ -165,12 +163,21 @@ def measure(
 def evaluate(settings: GraphSettings, complete: bool) -> Path:
     """Identify what a session has recorded, also where it is incomplete.
 
-    Returns the path of identification.json. Raises NodeFailed where something is missing.
+    Returns the path of identification.json, or of thermal.json after a thermal session, or of
+    dynamic.json where there is no static cycle. Raises NodeFailed where something is missing.
     """
+    from rtest_drivers.commands import dynamic
     from rtest_drivers.commands.identify import identify
+    from rtest_drivers.commands.thermal import evaluate as thermal
+    from rtest_estimation.records import Kind
+    from rtest_identification.session_file import load_session
 
+    kinds = {plan.kind for plan in load_session(settings.config).plans}
     try:
-        result = identify(settings.folder, quiet=True)
+        if Kind.DYNAMIC in kinds:
+            result = dynamic.evaluate(settings.folder)
+        if Kind.STATIC in kinds:
+            result = (thermal if settings.thermal else identify)(settings.folder, quiet=True)
     except UserError as error:
         raise NodeFailed(f'{error}\n  recorded: {shown(settings.recording)}') from None
     if not complete:
@@ -182,7 +189,12 @@ def evaluate(settings: GraphSettings, complete: bool) -> Path:
 
 
 def _again(settings: GraphSettings) -> str:
-    return f'rtest identify {shlex.quote(shown(settings.folder))}'
+    from rtest_identification.session_file import DYNAMIC, load_session
+
+    command = 'thermal' if settings.thermal else 'identify'
+    if load_session(settings.config).kind == DYNAMIC:
+        command = 'dynamic'
+    return f'rtest {command} {shlex.quote(shown(settings.folder))}'
 
 
 def _check_truth(truth: Path, plans: Sequence[CyclePlan]) -> None:

@@ -38,39 +38,56 @@ def run(arguments: argparse.Namespace) -> int:
     several = len(arguments.bags) > 1
     for bag in arguments.bags:
         out = arguments.out / recording_name(bag) if arguments.out and several else arguments.out
-        _one(bag, arguments, out or default_output(bag, OUTPUT))
+        evaluate(bag, out, arguments.machine, arguments.priors, not arguments.no_report)
     return 0
 
 
-def _one(bag: Path, arguments: argparse.Namespace, out: Path) -> None:
+def evaluate(
+    bag: Path,
+    out: Path | None = None,
+    machine: Path | None = None,
+    priors: Path | None = None,
+    report: bool = True,
+    quiet: bool = False,
+) -> Path:
+    """Evaluate one recording, with progress and a last line that says what was found.
+
+    quiet : without what a session has said of its cycles already
+
+    Returns the path of thermal.json.
+    """
     from rtest_drivers.commands.session import shown
     from rtest_drivers.folders import check_folder, writing
     from rtest_identification.thermal import output, words
     from rtest_identification.thermal.offline import thermal_recording
 
+    out = out or default_output(bag, OUTPUT)
     check_folder(out)
     result = thermal_recording(
-        bag, arguments.machine, lambda line: print(f'  {line}', flush=True),
-        priors_path=arguments.priors,
+        bag, machine, lambda line: quiet or print(f'  {line}', flush=True), priors_path=priors
     )
     for line in _lines(result):
         print(f'  {line}')
     with writing(out):
         path = output.write(result, out)
-        if not arguments.no_report:
+        if report:
             from rtest_identification.thermal.report import write_report
 
             write_report(result, out)
     print(f'{recording_name(bag)}: {words.summary(result)} -> {shown(path.absolute())}',
           flush=True)
+    return path
 
 
 def _lines(result: Thermal) -> list[str]:
-    """Warnings, and what is known of every error that drifts."""
+    """Warnings, temperatures, and what is known of every error that drifts."""
     from rtest_identification.thermal import words
 
     lines = [f'missing: {line}' for line in words.missing(result)]
     lines += [f'warning: {warning}' for warning in result.warnings]
+    for one in result.thermometers:
+        if change := words.warming(result, one):
+            lines.append(f'{one.sensor}: {change}')
     for one in result.drifting:
         lines.append(words.drift(one))
         lines += [f'  time constant {words.tau(c)}' for c in one.constants]

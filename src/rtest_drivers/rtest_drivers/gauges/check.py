@@ -1,17 +1,17 @@
-"""Trying the controllers of a nest before a session: what answers, how often, how evenly."""
+"""Trying controllers on lines before a session: what answers, how often, how evenly."""
 
 from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from rtest_drivers.clock import HostClock
 from rtest_drivers.gauges.align import Sample
-from rtest_drivers.gauges.config import ControllerConfig, NestConfig
+from rtest_drivers.gauges.config import ControllerConfig
 from rtest_drivers.gauges.controller import Controller
 from rtest_estimation.records import Status
 
@@ -21,13 +21,13 @@ _START_S = 8.0
 
 @dataclass(frozen=True)
 class ChannelCheck:
-    """One gauge.
+    """One gauge or thermometer.
 
-    channel : in the nest, from 1
-    last : last valid reading, in the nest's sense [m]; NaN where there was none
+    channel : in the nest, or in the order of its device file, from 1
+    last : last valid reading, in the nest's sense [m], or [deg C]; NaN where there was none
     status : of the last reading; None where there was none
-    noise : standard deviation of a single reading [m], from the differences of neighbours, so that
-        a drift is not in it; NaN with fewer than three valid readings
+    noise : standard deviation of a single reading [m] or [K], from the differences of neighbours,
+        so that a drift is not in it; NaN with fewer than three valid readings
     """
 
     channel: int
@@ -46,7 +46,7 @@ class ControllerCheck:
     interval_std, interval_max : of the times between readings [s]
     skew_mean, skew_max : distance in time to the nearest reading of the first controller [s]
     stamp_uncertainty : largest one of a reading's time [s]
-    unit, limits : from the device file, the latter [m] or None
+    unit, limits : from the device file, the latter [m] or [deg C] or None
     unanswered : questions without a legal answer
     """
 
@@ -67,13 +67,15 @@ class ControllerCheck:
     channels: tuple[ChannelCheck, ...]
 
 
-def check_nest(config: NestConfig, seconds: float = 2.0) -> tuple[ControllerCheck, ...]:
+def check_controllers(
+    configs: Sequence[ControllerConfig], seconds: float = 2.0
+) -> tuple[ControllerCheck, ...]:
     """Ask every controller for some seconds; one result each, in the order of the device file.
 
     Raises nothing where a controller does not answer: that is a result.
     """
     clock, changed = HostClock(), threading.Condition()
-    samples: list[list[tuple[int, Sample]]] = [[] for _ in config.controllers]
+    samples: list[list[tuple[int, Sample]]] = [[] for _ in configs]
 
     def notify() -> None:
         with changed:
@@ -81,7 +83,7 @@ def check_nest(config: NestConfig, seconds: float = 2.0) -> tuple[ControllerChec
 
     controllers = [
         Controller(one, clock, _collect(found), notify)
-        for one, found in zip(config.controllers, samples, strict=True)
+        for one, found in zip(configs, samples, strict=True)
     ]
     for controller in controllers:
         controller.start()

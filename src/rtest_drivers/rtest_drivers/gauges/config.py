@@ -17,17 +17,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import yaml
-
+from rtest_drivers.addresses import split_url
 from rtest_drivers.gauges import heidenhain, keyence, line_protocol, mitutoyo
 from rtest_drivers.gauges.frames import UNITS, Line, Protocol
 from rtest_estimation.errors import UserError
 from rtest_estimation.messages import MAX_CHANNELS
+from rtest_estimation.yaml_text import read_yaml
 from rtest_identification.session_reader import Reader
 
 # Name to what makes the protocol, and the keys of the device file that are its own.
@@ -53,7 +54,7 @@ class ControllerConfig:
 
     name : of its protocol
     channels : of the nest, from 0, in the order of its outputs
-    unit : 'mm', 'um' or 'inch'; scale : [m] of one unit
+    unit : 'mm', 'um' or 'inch'
     signs : of each channel, +1 or -1
     limits : range of the controller's value [m]; None where the file gives none
     rate : questions a second [1/s]; timeout : longest wait for an answer [s]
@@ -70,10 +71,15 @@ class ControllerConfig:
     rate: float
     timeout: float
 
-    @property
-    def scale(self) -> float:
-        """[m] of one unit."""
-        return UNITS[self.unit]
+    def physical(self, output: int, value: float) -> tuple[float, str]:
+        """What the controller's value means: displacement in the nest's sense [m].
+
+        Beside it why it is out of range, '' where it is not.
+        """
+        metres = value * UNITS[self.unit]
+        if self.limits is not None and not self.limits[0] <= metres <= self.limits[1]:
+            return math.nan, f'{value:g} {self.unit} is beyond range_mm'
+        return self.signs[output] * metres, ''
 
 
 @dataclass(frozen=True)
@@ -101,13 +107,17 @@ def range_text(config: NestConfig) -> str:
 
 def load_nest(path: Path | str) -> NestConfig:
     """Read a device file; raises UserError naming file, key and what is expected."""
-    try:
-        # The loader makes nothing but plain values, as SafeLoader does.
-        data = yaml.load(Path(path).read_text(encoding='utf-8'), _Loader)
-    except (OSError, UnicodeDecodeError) as error:
-        raise UserError(f'{path}: cannot read the device file: {error}') from None
-    except yaml.YAMLError as error:
-        raise UserError(f'{path}: not valid YAML: {" ".join(str(error).split())}') from None
+    controllers = tuple(_controller(reader) for reader in controller_entries(path))
+    _check(str(path), controllers)
+    return NestConfig(controllers)
+
+
+def controller_entries(path: Path | str) -> list[Reader]:
+    """The mappings in the list `controllers` of a device file.
+
+    Raises UserError naming file, key and what is expected.
+    """
+    data = read_yaml(path, 'the device file')
     if not isinstance(data, dict):
         raise UserError(f'{path}: expected a mapping with the key controllers')
     reader = Reader(str(path), data)
@@ -115,32 +125,46 @@ def load_nest(path: Path | str) -> NestConfig:
     entries = reader.required('controllers')
     if not isinstance(entries, list) or not entries:
         raise UserError(f'{path}: controllers: expected a list of mappings')
-    controllers = tuple(
-        _controller(f'{path}: controllers: {number}', entry)
-        for number, entry in enumerate(entries, 1)
-    )
-    _check(str(path), controllers)
-    return NestConfig(controllers)
+    for number, entry in enumerate(entries, 1):
+        if not isinstance(entry, dict):
+            raise UserError(f'{path}: controllers: {number}: expected a mapping of a controller')
+    return [
+        Reader(f'{path}: controllers: {number}', entry) for number, entry in enumerate(entries, 1)
+    ]
 
 
-def _controller(where: str, entry: Any) -> ControllerConfig:
-    if not isinstance(entry, dict):
-        raise UserError(f'{where}: expected a mapping of {sorted(_KEYS)}')
-    reader = Reader(where, entry)
-    name = _choice(reader, 'protocol', PROTOCOLS)
+def port_of(reader: Reader) -> str:
+    """The key `port`."""
+    port = reader.required('port')
+    if not isinstance(port, str) or not _port_is_good(port):
+        raise UserError(
+            f'{reader.where}: port: expected a device, socket://HOST:PORT or rfc2217://HOST:PORT, '
+            f'got {port!r}'
+        )
+    return port
+
+
+def different_ports(path: str, controllers: Sequence[ControllerConfig]) -> None:
+    """Raise UserError where two controllers are to be at one port."""
+    ports = [controller.port for controller in controllers]
+    for port in ports:
+        if ports.count(port) > 1:
+            raise UserError(f'{path}: controllers: port {port} is given twice')
+
+
+def _controller(reader: Reader) -> ControllerConfig:
+    name = choice(reader, 'protocol', PROTOCOLS)
     make, options = PROTOCOLS[name]
     reader.only(_KEYS | options)
-    port = reader.required('port')
-    if not isinstance(port, str) or not port:
-        raise UserError(f'{where}: port: expected a device or URL, got {port!r}')
+    port = port_of(reader)
     channels = _whole_numbers(reader, 'channels')
-    unit = _choice(reader, 'unit', UNITS)
+    unit = choice(reader, 'unit', UNITS)
     protocol = make(len(channels), unit, reader)
     return ControllerConfig(
         name,
         protocol,
         port,
-        _line(reader, protocol.line),
+        line_settings(reader, protocol.line),
         tuple(channel - 1 for channel in channels),
         unit,
         _signs(reader, len(channels)),
@@ -150,12 +174,17 @@ def _controller(where: str, entry: Any) -> ControllerConfig:
     )
 
 
+def _port_is_good(port: str) -> bool:
+    """A path, or one of the two kinds of URL that are a line; pyserial knows others."""
+    if '://' not in port:
+        return bool(port) and port.isprintable()
+    parts = split_url(port)
+    return parts is not None and parts.scheme in ('socket', 'rfc2217') and parts.port is not None
+
+
 def _check(path: str, controllers: tuple[ControllerConfig, ...]) -> None:
     """What must fit between the controllers."""
-    ports = [controller.port for controller in controllers]
-    for port in ports:
-        if ports.count(port) > 1:
-            raise UserError(f'{path}: controllers: port {port} is given twice')
+    different_ports(path, controllers)
     channels = sorted(channel + 1 for one in controllers for channel in one.channels)
     if channels != list(range(1, len(channels) + 1)):
         raise UserError(
@@ -166,10 +195,11 @@ def _check(path: str, controllers: tuple[ControllerConfig, ...]) -> None:
         raise UserError(f'{path}: controllers: expected at most {MAX_CHANNELS} channels')
 
 
-def _line(reader: Reader, factory: Line) -> Line:
+def line_settings(reader: Reader, factory: Line) -> Line:
+    """The keys baud, bytesize, parity and stopbits; the factory settings where not given."""
     parity = factory.parity
     if 'parity' in reader.data:
-        parity = _choice(reader, 'parity', ('none', 'even', 'odd'))
+        parity = choice(reader, 'parity', ('none', 'even', 'odd'))
     return Line(
         reader.integer('baud', factory.baud, (50, 4_000_000)),
         reader.integer('bytesize', factory.bytesize, (7, 8)),
@@ -206,20 +236,9 @@ def _whole_numbers(reader: Reader, key: str) -> list[int]:
     return value
 
 
-def _choice(reader: Reader, key: str, known: Any) -> str:
+def choice(reader: Reader, key: str, known: Any) -> str:
+    """One of the names in `known`, which must be given."""
     value = reader.required(key)
     if not isinstance(value, str) or value not in known:
         raise UserError(f'{reader.where}: {key}: expected one of {sorted(known)}, got {value!r}')
     return value
-
-
-class _Loader(yaml.SafeLoader):
-    """Refuses a key that is there twice, of which YAML silently takes the last."""
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict:
-        mapping = super().construct_mapping(node, deep)
-        if len(mapping) != len(node.value):
-            raise yaml.constructor.ConstructorError(
-                None, None, 'a key is there twice', node.start_mark
-            )
-        return mapping

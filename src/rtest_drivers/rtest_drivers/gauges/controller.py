@@ -179,16 +179,16 @@ class Controller:
         self._deliver(index, Sample(stamp[0], values, status, stamp[1]))
 
     def _physical(self, output: int, reading: Reading) -> tuple[float, Status]:
-        """Displacement [m] in the nest's sense, checked against the range."""
+        """Reading in SI units, a displacement in the nest's sense, checked against the range."""
         if reading.status is not Status.VALID:
             self.note = reading.reason
             self.faults += reading.status is Status.DEVICE_ERROR
             return math.nan, reading.status
-        value, limits = reading.value * self.config.scale, self.config.limits
-        if limits is not None and not limits[0] <= value <= limits[1]:
-            self.note = f'{reading.value:g} {self.config.unit} is beyond range_mm'
+        value, problem = self.config.physical(output, reading.value)
+        if problem:
+            self.note = problem
             return math.nan, Status.OUT_OF_RANGE
-        return self.config.signs[output] * value, Status.VALID
+        return value, Status.VALID
 
     # --- the line ---
 

@@ -73,7 +73,7 @@ def lkg(outputs: int, unit: str, options: Reader) -> Protocol:
     setup = [Command(b'R0\r', re.compile(rb'R0|ER,R0,\d\d'))]
     if 'sampling_us' in options.data:
         sampling = options.data['sampling_us']
-        if isinstance(sampling, bool) or sampling not in _SAMPLING:
+        if type(sampling) is not int or sampling not in _SAMPLING:
             raise UserError(
                 f'{options.where}: sampling_us: expected one of {sorted(_SAMPLING)}, '
                 f'got {sampling!r}'

@@ -1,4 +1,4 @@
-"""The simulated machine cell as a process: the hardware behind both drivers, and the clock."""
+"""The simulated machine cell as a process: the hardware behind the drivers, and the clock."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from rclpy.node import Node
 from rosgraph_msgs.msg import Clock as ClockMessage
 from rtest_msgs.msg import CyclePlan
 
-from rtest_drivers.cell_link import CHANNELS, CNC, DEFAULT_ADDRESS, GAUGES, CellServer
+from rtest_drivers.cell_link import CNC, DEFAULT_ADDRESS, GAUGES, THERMOMETERS, CellServer
 from rtest_drivers.nodes.driver import run
 from rtest_drivers.sim.cell import Cell
 from rtest_drivers.sim.truth import load_truth, unmet
@@ -26,12 +26,16 @@ _TICK_S = 0.01
 # After a pause (a slow driver, a busy computer) simulated time goes on, it does not catch up.
 _LONGEST_TICK_S = 0.05
 _STEP_NS = 200_000_000
+# In a tick while the machine only warms up.
+_WAITING_STEP_NS = 10_000_000_000
 
 
 class CellNode(Node):
-    """Node 'cell': simulated time, plans in, readings and feedback out over the link.
+    """Node 'cell': simulated time, plans in, what the devices read out over the link.
 
-    Simulated time stands still while a connected driver has not dealt with what it was sent.
+    Simulated time stands still while a connected driver has not dealt with what it was sent. It
+    runs at `rate`, faster while the cell waits long for a plan that is known already and its truth
+    file has `waiting_read_every_s`.
     """
 
     def __init__(self) -> None:
@@ -105,10 +109,12 @@ class CellNode(Node):
         if self._rate:
             if self._server.taken:
                 self._advance(round(self._rate * passed * 1e9))
+                if (until := self._cell.waits_until) is not None:
+                    self._advance(min(_WAITING_STEP_NS, until - self._cell.now))
             else:
                 self._held += 1
-        elif len(self._server.connected) == len(CHANNELS):
-            # As fast as possible starts when both drivers look on, not before.
+        elif {GAUGES, CNC} <= set(self._server.connected):
+            # As fast as possible starts when these drivers look on, not before.
             while time.monotonic() - woken < 0.8 * _TICK_S:
                 if self._server.taken:
                     self._advance(_STEP_NS)
@@ -120,6 +126,7 @@ class CellNode(Node):
         output = self._cell.advance(self._cell.now + step)
         self._server.send(GAUGES, output.blocks)
         self._server.send(CNC, output.feedback)
+        self._server.send(THERMOMETERS, output.temperatures)
 
     def _report(self) -> None:
         now, cell = time.monotonic(), self._cell
@@ -129,7 +136,7 @@ class CellNode(Node):
         if cell.busy and cell.run is not None:
             text = f'measuring {cell.run.plan.cycle}'
         elif cell.waiting:
-            text = 'waiting for the stamp of a plan'
+            text = 'waiting for the start of a plan'
         held, ticks = self._held, max(self._ticks, 1)
         self._held = self._ticks = 0
         values = {

@@ -1,4 +1,4 @@
-"""What the gauge and the CNC driver have in common: life cycle, reading thread, diagnostics."""
+"""What the drivers have in common: life cycle, reading thread, diagnostics."""
 
 from __future__ import annotations
 
@@ -40,13 +40,18 @@ class Driver(Node):
     """
 
     def __init__(
-        self, name: str, topic: str, message: type, backends: dict[str, Callable[[str], Any]]
+        self,
+        name: str,
+        topic: str,
+        message: type,
+        backends: dict[str, Callable[[str], Any]],
+        silence: float = 2.0,
     ) -> None:
         super().__init__(name)
         self._backends = backends
         self._parameter('backend', 'cell', f'where the data come from, one of {sorted(backends)}')
         self._parameter('address', DEFAULT_ADDRESS, 'device file; of the backend cell, a socket')
-        self._parameter('silence_s', 2.0, 'time without data that is reported as an error [s]')
+        self._parameter('silence_s', silence, 'time without data that is reported as an error [s]')
         self._publisher = self.create_lifecycle_publisher(message, topic, STREAM)
         self._diagnostics = diagnostics.Diagnostics(self)
         # Not in ROS time: the clock may come from the very device that is lost.
@@ -61,7 +66,7 @@ class Driver(Node):
         self._reconnects = 0
         self._received = time.monotonic()
 
-    # --- what the two drivers differ in ---
+    # --- what the drivers differ in ---
 
     @abstractmethod
     def start(self) -> None:
@@ -206,7 +211,9 @@ class Driver(Node):
         self._diagnostics.publish(status)
 
     def _parameter(self, name: str, default: Any, description: str) -> None:
-        self.declare_parameter(name, default, ParameterDescriptor(description=description))
+        # Read-only: who can call services of this node cannot name another device.
+        descriptor = ParameterDescriptor(description=description, read_only=True)
+        self.declare_parameter(name, default, descriptor)
 
 
 def run(make_node: Callable[[], Any], args: list[str] | None = None) -> int:

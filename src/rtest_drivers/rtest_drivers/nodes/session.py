@@ -7,6 +7,9 @@ at any time, or go on with the next one. `session/calibrate` measures the nest o
 and then the cycle; `session/abort` ends the session with what there is. None of them stops the
 machine.
 
+The cycles of a thermal session begin at their times; one whose predecessor takes longer begins
+after it and is told to be late.
+
 Parameters
 ----------
 config : session file (YAML)
@@ -24,9 +27,10 @@ import re
 import sys
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +38,7 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from lifecycle_msgs.msg import State, Transition
 from lifecycle_msgs.srv import ChangeState, GetState
+from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.client import Client
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
@@ -45,12 +50,13 @@ from std_srvs.srv import Trigger
 from rtest_drivers.clock import HostClock
 from rtest_drivers.cnc.programs import program_of, start_program
 from rtest_drivers.graph import INCOMPLETE
-from rtest_drivers.schedule import NANOSECONDS, STOPPED_S, Progress, pose_count
+from rtest_drivers.provenance import TOPIC, provenance
+from rtest_drivers.schedule import NANOSECONDS, STOPPED_S, Progress, pose_count, turn
 from rtest_estimation.errors import UserError
 from rtest_estimation.missing import grouped
 from rtest_estimation.nodes import diagnostics, publish
 from rtest_estimation.nodes.qos import LATCHED, LATCHED_100
-from rtest_estimation.records import CyclePlan, Kind, Missing
+from rtest_estimation.records import CyclePlan, Kind, Missing, NestKind
 from rtest_identification.session_file import (
     BY_HAND,
     UNATTENDED,
@@ -60,11 +66,10 @@ from rtest_identification.session_file import (
 from rtest_identification.urdf import describe
 
 DRIVERS = ('gauges', 'cnc')
+THERMOMETERS = 'thermometers'
 # Who must not miss the first reading.
 LISTENERS = ('recorder', 'estimator')
 STREAMS = ('rtest/gauges', 'rtest/cnc/feedback')
-# Closed in this order: what the earlier one publishes last, the later one still needs.
-FINISHERS = ('estimator', 'identifier', 'recorder')
 # Wall time a service may take [s]: an identification of a long session is the longest.
 SERVICE_TIMEOUT_S = 120.0
 # A subscription is seen in the graph a little before its publisher has matched it [s].
@@ -74,7 +79,7 @@ OTHERS_S = 3.0
 # How often progress is told: of a simulated cycle, of a real one [s].
 PROGRESS_S, SLOW_PROGRESS_S = 2.0, 10.0
 # Warnings of these nodes are told at the end, or are our own.
-QUIET = ('identifier', 'session')
+QUIET = ('identifier', 'thermal', 'session')
 # A simulated clock that stands still this long has lost its cell [s].
 CLOCK_TIMEOUT_S = 30.0
 # An NC program that has ended for so long has left its cycle: the estimator would have finished
@@ -112,29 +117,42 @@ class SessionNode(Node):
 
     def __init__(self) -> None:
         super().__init__('session')
-        self.session = self.declare_parameter('session', 'session').value
-        self.simulated = self.declare_parameter('simulated', False).value
-        self.ready_timeout = self.declare_parameter('ready_timeout', 30.0).value
-        self.cycle_timeout = self.declare_parameter('cycle_timeout', 0.0).value
-        self.hold = self.declare_parameter('hold', False).value
-        config = self.declare_parameter('config', '').value
+        # Read once: who can call services of this node cannot name another file.
+        fixed = ParameterDescriptor(read_only=True)
+        self.session = self.declare_parameter('session', 'session', fixed).value
+        self.simulated = self.declare_parameter('simulated', False, fixed).value
+        self.ready_timeout = self.declare_parameter('ready_timeout', 30.0, fixed).value
+        self.cycle_timeout = self.declare_parameter('cycle_timeout', 0.0, fixed).value
+        self.hold = self.declare_parameter('hold', False, fixed).value
+        config = self.declare_parameter('config', '', fixed).value
         self.config: SessionConfig = load_session(config)
-        self._folder = Path(config).parent
+        self._file, self._folder = Path(config), Path(config).parent
+        more = (THERMOMETERS,) if self.config.reads_temperatures(self.simulated) else ()
+        self._drivers = (*DRIVERS, *more)
+        # Closed in this order: what the earlier one publishes last, the later one still needs.
+        identifier = 'thermal' if self.config.every else 'identifier'
+        self._finishers = ('estimator', identifier, 'recorder')
         # As the drivers' stamps, so that a clock that is set does not part plan and readings.
         self._host = HostClock()
 
         self._machine = self.create_publisher(String, 'rtest/machine', LATCHED)
         self._description = self.create_publisher(String, 'robot_description', LATCHED)
+        self._provenance = self.create_publisher(String, TOPIC, LATCHED)
         self._plans = self.create_publisher(CyclePlanMessage, 'rtest/plan', LATCHED_100)
         self._diagnostics = diagnostics.Diagnostics(self)
         self.create_subscription(Cycle, 'rtest/cycle', self._on_cycle, LATCHED_100)
         self.create_subscription(NestCalibration, 'rtest/nest', self._on_nest, LATCHED)
         self.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, 100)
         self._change = {
-            name: self.create_client(ChangeState, f'{name}/change_state') for name in DRIVERS
+            name: self.create_client(ChangeState, f'{name}/change_state')
+            for name in self._drivers
         }
-        self._state = {name: self.create_client(GetState, f'{name}/get_state') for name in DRIVERS}
-        self._finish = {name: self.create_client(Trigger, f'{name}/finish') for name in FINISHERS}
+        self._state = {
+            name: self.create_client(GetState, f'{name}/get_state') for name in self._drivers
+        }
+        self._finish = {
+            name: self.create_client(Trigger, f'{name}/finish') for name in self._finishers
+        }
         for wish in GRANTED:
             self.create_service(Trigger, f'~/{wish}', partial(self._on_wish, wish))
 
@@ -149,10 +167,9 @@ class SessionNode(Node):
         self._finished: dict[str, dict[str, str]] = {}
         self._complaints: dict[tuple[str, str], tuple[int, str]] = {}
         self._problems: list[str] = []
-        self._closing = False
         self._status = 'waiting for the other nodes'
         self._cycle_number = 0
-        self._wish = self._held = ''
+        self._wish, self._held, self._following = '', '', False
         # What each driver last said, and the state of the NC program: since when it has not run.
         self._said: dict[str, str] = {}
         self._heard = 0
@@ -167,25 +184,30 @@ class SessionNode(Node):
         Raises SessionError where it cannot go on.
         """
         self._wait_for_nodes()
+        if self.simulated:
+            # The drivers are opened next, and need it.
+            self._wait_for('/clock of the simulated cell', lambda: self._now() > 0)
         self._machine.publish(String(data=self.config.machine.text))
         self._description.publish(String(data=describe(self.config)))
-        for name in DRIVERS:
+        self._provenance.publish(String(data=self._made_by()))
+        for name in self._drivers:
             self._bring_to(name, State.PRIMARY_STATE_INACTIVE)
         self._wait_for_listeners()
-        for name in DRIVERS:
+        for name in self._drivers:
             self._bring_to(name, State.PRIMARY_STATE_ACTIVE)
-        if self.simulated:
-            self._wait_for('/clock of the simulated cell', lambda: self._now() > 0)
         poses = sum(len(plan.commands) for plan in self.config.plans)
         self.say(f'{self.config.machine.name}: {len(self.config.plans)} cycles, {poses} poses')
         started = {}
+        # Of the repeated cycles: when each is to begin.
+        turns = self._turns()
         left = deque(enumerate(self.config.plans, 1))
         while left and self._wish != ABORT:
             self._cycle_number, plan = left.popleft()
+            timed = self.config.every and plan.kind is Kind.STATIC and plan.cycle not in started
             keys = started.setdefault(plan.cycle, [])
             if self._may_start(plan):
                 measure = self._measure if self.simulated else self._measure_on_machine
-                keys += measure(plan)
+                keys += measure(plan, next(turns) if timed else 0)
             if self._wish == CALIBRATE:
                 left.extendleft(self._calibration(self._cycle_number, plan))
         if self._wish == ABORT:
@@ -194,12 +216,23 @@ class SessionNode(Node):
             self._problem('ended as was asked for' + (
                 f'; not measured: {", ".join(names)}' if names else ''
             ))
-        self._status, self._closing = 'finishing', True
+        self._status = 'finishing'
         self._close()
         self._judge(started)
         self._status = 'finished'
         self._diagnose()
         return self._problems
+
+    def _turns(self) -> Iterator[int]:
+        """Times at which repeated cycles begin [ns], from the first question on."""
+        start = self._now()
+        for number in count():
+            yield start + round(number * self.config.every * 1e9)
+
+    def _made_by(self) -> str:
+        devices = {} if self.simulated else self.config.devices
+        files = {name: device.file for name, device in devices.items()}
+        return provenance(self.session, self._file, files)
 
     def _wait_for_nodes(self) -> None:
         clients = {f'{name}/change_state': client for name, client in self._change.items()}
@@ -290,12 +323,25 @@ class SessionNode(Node):
         ]
         return again if plan.kind is Kind.NEST_CALIBRATION else [(number, plan), *again]
 
-    def _measure(self, plan: CyclePlan) -> list[tuple[str, int]]:
+    def _tell_turn(self, plan: CyclePlan, due: int) -> None:
+        """Say when a repeated cycle is to begin, or that it is late. due : [ns], 0 for at once."""
+        text, late = turn(due, self._now()) if due else ('', False)
+        if late:
+            self.get_logger().warning(f'{plan.cycle}: {text}')
+        if text:
+            self._status = f'waiting for {plan.cycle}'
+            self._say_cycle(plan, text)
+
+    def _measure(self, plan: CyclePlan, due: int) -> list[tuple[str, int]]:
         """Publish one plan and wait for its finished cycle; returns its key.
 
         Goes on where the cycle has stopped; it is then finished by the next plan or at the end.
+
+        due : when it is to begin [ns]. The plan is published at once: a simulated cell that knows
+            for how long it has nothing to do lets that time pass quickly
         """
-        key = self._start(plan)
+        self._tell_turn(plan, due)
+        key = self._start(plan, due)
         shown, told = time.monotonic(), 0
         progress = Progress(plan, key[1], shown, self.cycle_timeout)
         while key not in self._cycles:
@@ -308,6 +354,8 @@ class SessionNode(Node):
             if key in self._cycles or self._wish == ABORT:
                 break
             done, poses = self._progress(key)
+            if done:
+                self._status = f'measuring {plan.cycle}'
             if why := progress.stopped(now, wall, done, self._feedback_age):
                 self.get_logger().warning(f'{plan.cycle}: {why}')
                 self._say_cycle(plan, f'{why}; going on')
@@ -317,11 +365,20 @@ class SessionNode(Node):
                 self._say_cycle(plan, f'{done} of {poses} poses')
         return [key]
 
-    def _measure_on_machine(self, plan: CyclePlan) -> list[tuple[str, int]]:
+    def _measure_on_machine(self, plan: CyclePlan, due: int) -> list[tuple[str, int]]:
         """Measure a cycle whose NC program runs on a real machine; the keys of all attempts.
 
-        Waits as long as it takes until somebody starts the program.
+        Waits as long as it takes until somebody starts the program. due : when it is to begin [ns]
         """
+        self._tell_turn(plan, due)
+        self._wish = ''
+        self._following = True
+        while (left := (due - self._now()) / NANOSECONDS) > 0.0:
+            if self.wait(lambda: self._wish in (SKIP, CALIBRATE, ABORT), left):
+                self._following = False
+                self._say_cycle(plan, f'{self._wish}, as was asked for')
+                return []
+        self._following = False
         device = self.config.devices.get('cnc')
         by_hand = device is None or device.programs == BY_HAND
         keys = []
@@ -335,7 +392,9 @@ class SessionNode(Node):
             if by_hand:
                 self._say_cycle(plan, f'start {self._program_name(plan)}')
             by_hand = True
+            self._following = True
             again = self._follow(plan, keys[-1])
+            self._following = False
             if not again:
                 return keys
 
@@ -370,11 +429,14 @@ class SessionNode(Node):
             self._say_cycle(plan, f'{self._wish}, as was asked for')
         return self._wish == REPEAT
 
-    def _start(self, plan: CyclePlan) -> tuple[str, int]:
-        """Publish a plan; returns the key of its cycle. The one before ends with it."""
-        stamp = self._now()
+    def _start(self, plan: CyclePlan, due: int = 0) -> tuple[str, int]:
+        """Publish a plan; returns the key of its cycle. The one before ends with it.
+
+        due : when the cycle begins [ns]; at once where that is past
+        """
+        stamp = max(self._now(), due)
         key = (plan.cycle, stamp)
-        self._status = f'measuring {plan.cycle}'
+        self._status = f'{"waiting for" if due > self._now() else "measuring"} {plan.cycle}'
         self._poses_done = self._feedback_age = None
         self._ran = False
         self._open[key] = plan
@@ -444,28 +506,31 @@ class SessionNode(Node):
             # Every reason is told with the result of the session.
             first, *more = grouped(missing) or ['']
             text += f' ({first}{"; ..." if more else ""})' if first else ''
+        if plan.kind is Kind.DYNAMIC and not cycle.missing:
+            return 'recorded'
         if plan.kind is Kind.NEST_CALIBRATION:
             # The calibration is on another topic and may come a moment later.
             self.wait(lambda: cycle.calibration in self._nests, 1.0 if cycle.calibration else 0.0)
             nest = self._nests.get(cycle.calibration)
             text += f', residual {nest.residual * 1e6:.2f} µm' if nest else ', no calibration'
+            if nest and nest.kind == NestKind.LASER:
+                text += ' before the correction'
         return text
 
     def _judge(self, started: dict[str, list[tuple[str, int]]]) -> None:
         """A cycle that says nothing is a problem; single missing poses are not."""
         lost = [
             name for name, keys in started.items()
-            # Displacements count from the first point: alone it is zero.
-            if not any(key in self._cycles and len(self._cycles[key].points) > 1 for key in keys)
+            if not any(key in self._cycles and _says(self._cycles[key]) for key in keys)
         ]
         if lost:
             self._problem(f'incomplete: nothing was measured in {", ".join(lost)}')
 
     def _close(self) -> None:
-        for name in DRIVERS:
+        for name in self._drivers:
             if not self._transition(name, Transition.TRANSITION_DEACTIVATE):
                 self._problem(f'driver {name} could not be deactivated')
-        for name in FINISHERS:
+        for name in self._finishers:
             # Let the last messages of the one before arrive.
             self.wait(lambda: False, SETTLE_S)
             self._tell_finished()
@@ -561,7 +626,7 @@ class SessionNode(Node):
     def _note_driver(self, status: DiagnosticStatus, values: dict[str, str]) -> None:
         """What a driver says, and whether an NC program runs."""
         name = status.name.rpartition('/')[2].partition(':')[0]
-        if name not in DRIVERS:
+        if name not in self._drivers:
             return
         self._said[name] = '' if status.level == diagnostics.OK else status.message
         if name != 'cnc':
@@ -595,11 +660,12 @@ class SessionNode(Node):
             return '' if self._held else 'no cycle waits to be started'
         if self._held:
             return 'there is nothing to repeat' if wish == REPEAT else ''
-        # A simulated cycle needs nobody, and goes on to its end before a calibration.
+        # A simulated cycle needs nobody, and goes on to its end before a calibration. Otherwise a
+        # wish would be remembered, and meet a cycle that nobody meant.
         interrupts = wish in (REPEAT, SKIP)
-        if not self._open or self._closing or (interrupts and self.simulated):
-            return f'there is nothing to {"repeat or skip" if interrupts else wish}'
-        return ''
+        if self._following or (self.simulated and self._open and not interrupts):
+            return ''
+        return f'there is nothing to {"repeat or skip" if interrupts else wish}'
 
     def _diagnose(self) -> None:
         level = diagnostics.WARN if self._problems else diagnostics.OK
@@ -613,6 +679,17 @@ class SessionNode(Node):
             'waits_for_start': self._held,
         }
         self._diagnostics.publish(diagnostics.status('session: progress', level, text, values))
+
+
+def _says(cycle: Cycle) -> bool:
+    """Whether a finished cycle says anything.
+
+    Displacements of poses count from the first point: alone it is zero. A dynamic cycle has
+    readings only, of which those between its poses count.
+    """
+    if cycle.plan.kind == Kind.DYNAMIC:
+        return len(cycle.plan.commands) // len(cycle.plan.axes) - len(cycle.missing) > 1
+    return len(cycle.points) > 1
 
 
 def main(args: list[str] | None = None) -> int:

@@ -9,19 +9,36 @@ from __future__ import annotations
 
 import zlib
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from rtest_drivers.sim import gauges
+from rtest_drivers.sim import gauges, laser
 from rtest_drivers.sim.faults import Window, timed, window
-from rtest_drivers.sim.kinematics import sphere_in_table
+from rtest_drivers.sim.kinematics import sphere_in_table, table_to_spindle, turn
 from rtest_drivers.sim.motion import SPINDLE, Timeline
 from rtest_drivers.sim.truth import Truth
+from rtest_drivers.sim.warming import WarmErrors
+from rtest_estimation.dwell import turns
 from rtest_estimation.errors import UserError
-from rtest_estimation.records import CyclePlan, Feedback, GaugeBlock, Kind, Status
+from rtest_estimation.records import (
+    CyclePlan,
+    Feedback,
+    GaugeBlock,
+    Kind,
+    Status,
+    Temperature,
+)
 
-_READINGS, _OUTLIERS, _ENCODERS = 1, 2, 3
+_READINGS, _OUTLIERS, _ENCODERS, _THERMOMETERS = 1, 2, 3, 4
+# Around a cycle everything is read as usual for so long: the end of one and the start of the next
+# are seen in the readings [ns].
+_NEAR_NS = 5_000_000_000
+# A dynamic cycle rests so long wherever it turns round; half the time over which speeds are
+# differences [ns].
+_REST, _HALF_SPAN = 1_000_000_000, 1_000_000
+# From and to [ns].
+Wait = tuple[int, int] | None
 
 
 @dataclass(frozen=True)
@@ -39,6 +56,7 @@ class Output:
 
     blocks: list[GaugeBlock]
     feedback: list[Feedback]
+    temperatures: list[Temperature] = field(default_factory=list)
 
 
 class Cell:
@@ -53,7 +71,7 @@ class Cell:
         self._plans: deque[CyclePlan] = deque()
         self._run: Run | None = None
         self._setup: str | None = None
-        self._nests: list[gauges.Nest] = []
+        self._nests: list[gauges.Nest | laser.LaserNest] = []
         self._windows: list[Window] = timed(truth.faults, epoch)
         self._reading = 0
         self._sequence = 0
@@ -62,6 +80,9 @@ class Cell:
         self._noise = np.random.default_rng([truth.seed, _READINGS])
         self._outliers = np.random.default_rng([truth.seed, _OUTLIERS])
         self._encoder_noise = np.random.default_rng([truth.seed, _ENCODERS])
+        self._warm_from: int | None = None
+        self._temperatures = 0
+        self._thermometer_noise = np.random.default_rng([truth.seed, _THERMOMETERS])
 
     @property
     def axes(self) -> tuple[str, ...]:
@@ -83,6 +104,12 @@ class Cell:
         """Whether a plan waits or is being carried out."""
         return bool(self._plans) or (self._run is not None and self.now < self._run.end)
 
+    @property
+    def waits_until(self) -> int | None:
+        """When readings are as usual again [ns]; None while they are."""
+        wait = self._long_wait()
+        return wait[1] if wait is not None and wait[0] <= self.now < wait[1] else None
+
     def queue(self, plan: CyclePlan) -> None:
         """Carry out a plan when those before it are done and its stamp has come.
 
@@ -102,9 +129,12 @@ class Cell:
             if due is not None and self.now < due < until:
                 step = due
             self.now = step
+            # Before the plan that ends it is taken.
+            wait = self._long_wait()
             self._start_plans()
-            self._read_gauges(output.blocks)
-            self._read_encoders(output.feedback)
+            self._read_gauges(output.blocks, wait)
+            self._read_encoders(output.feedback, wait)
+            self._read_thermometers(output.temperatures)
         return output
 
     # --- plans ---
@@ -115,18 +145,37 @@ class Cell:
         free = self._run.end if self._run else self.epoch
         return max(self._plans[0].stamp, free)
 
+    def _long_wait(self) -> Wait:
+        """The stretch before the next cycle in which little is read; None without one."""
+        due = self._next_start()
+        if not self.truth.thin or due is None:
+            return None
+        free = self._run.end if self._run else self.epoch
+        return free + _NEAR_NS, due - _NEAR_NS
+
+    def _wanted(self, numbers: np.ndarray, period: int, wait: Wait) -> np.ndarray:
+        """Which of the readings with these numbers are given, one every `period` [ns]."""
+        if wait is None:
+            return numbers
+        times = self.epoch + (numbers + 1) * period
+        near = (times < wait[0]) | (times >= wait[1])
+        return numbers[near | (numbers % max(self.truth.thin // period, 1) == 0)]
+
     def _start_plans(self) -> None:
         due = self._next_start()
         if due is not None and due <= self.now:
             self._start(self._plans.popleft(), self.now)
 
     def _start(self, plan: CyclePlan, start: int) -> None:
+        if plan.kind is Kind.STATIC and self._warm_from is None:
+            self._warm_from = start
         skipped = {
             fault.pose
             for fault in self.truth.faults
             if fault.kind == 'pose_skipped' and fault.cycle == plan.cycle
         }
-        dwell = round(plan.dwell * 1e9)
+        turning = turns(plan)
+        dwell = _REST if turning else round(plan.dwell * 1e9)
         columns = [self.axes.index(name) for name in plan.axes]
         poses: dict[int, tuple[int, int]] = {}
         clock = start
@@ -137,9 +186,10 @@ class Cell:
             if SPINDLE not in plan.axes:
                 target[-1] = 0.0
             target[columns] = row
-            offset = self.truth.gauges.dwell_noise * self._named(
-                f'{plan.cycle}/{pose}'
-            ).standard_normal(3)
+            # Nothing settles anew where a dynamic cycle turns round.
+            name = plan.cycle if turning else f'{plan.cycle}/{pose}'
+            offset = self.truth.gauges.dwell_noise * self._named(name).standard_normal(3)
+            speed = plan.feed if plan.kind is Kind.DYNAMIC and poses else 0.0
             if plan.setup != self._setup:
                 self._setup = plan.setup
                 leg = self._timeline.append(clock, target, -1, offset)
@@ -148,7 +198,7 @@ class Cell:
                 self._timeline.rest(clock, len(self._nests) - 1, offset)
             else:
                 clock = self._timeline.append(
-                    clock, target, len(self._nests) - 1, offset
+                    clock, target, len(self._nests) - 1, offset, speed, turning
                 ).arrival
             poses[pose] = (clock, clock + dwell)
             clock += dwell
@@ -176,24 +226,29 @@ class Cell:
                 on |= (times >= item.start) & (times < item.end)
         return on
 
-    def _read_gauges(self, blocks: list[GaugeBlock]) -> None:
+    def _read_gauges(self, blocks: list[GaugeBlock], wait: Wait) -> None:
         data = self.truth.gauges
         # Readings lie at epoch + 1, 2, ... periods; a block is complete with its last one.
         complete = (self.now - self.epoch) // data.period // data.batch * data.batch
         while self._reading < complete:
             stop = min(complete, self._reading + 64 * data.batch)
-            times = self.epoch + (np.arange(self._reading, stop) + 1) * data.period
+            firsts = self._wanted(
+                np.arange(self._reading // data.batch, stop // data.batch),
+                data.batch * data.period, wait,
+            )
+            numbers = (firsts[:, None] * data.batch + np.arange(data.batch)).ravel()
+            times = self.epoch + (numbers + 1) * data.period
             values, status = self._measure(times)
             silent = self._active('gauge_silent', times)
             lost = self._active('lost_block', times)
-            for first in range(0, stop - self._reading, data.batch):
+            for first in range(0, len(times), data.batch):
                 part = slice(first, first + data.batch)
                 if silent[part].any():
                     continue
                 if not lost[part].any():
                     blocks.append(
                         GaugeBlock(
-                            int(times[first]),
+                            int(times[first]) + round(data.late * 1e9),
                             self._sequence,
                             data.period * 1e-9 if data.batch > 1 else 0.0,
                             values[part],
@@ -217,20 +272,56 @@ class Cell:
         state = self._timeline.at(times)
         mounted = state.nest >= 0
         if mounted.any():
-            sphere = self._sphere(state.positions[mounted]) + state.offset[mounted]
-            readings = np.empty((len(sphere), shape[1]))
+            sphere = self._sphere(state.positions[mounted], times[mounted])
+            sphere += state.offset[mounted]
+            if data.friction:
+                velocity = self._velocity(times[mounted], state.positions[mounted])
+                sphere += gauges.friction(data, velocity)
+            surface = self._to_sphere(state.positions[mounted]) if data.laser else None
+            held, found = values[mounted], status[mounted]
             for index in np.unique(state.nest[mounted]):
                 rows = state.nest[mounted] == index
-                readings[rows] = self._nests[index].read(sphere[rows])
-            values[mounted], status[mounted] = gauges.limit(data, readings + noise[mounted])
+                held[rows], found[rows] = self._nests[index].measure(
+                    sphere[rows], noise[mounted][rows], None if surface is None else surface[rows]
+                )
+            values[mounted], status[mounted] = held, found
         return self._spoil(times, values, status)
 
-    def _sphere(self, positions: np.ndarray) -> np.ndarray:
-        """True sphere centre in the table frame (n, 3) [m]; the run-out turns with the spindle."""
+    def _sphere(self, positions: np.ndarray, times: np.ndarray) -> np.ndarray:
+        """True sphere centre in the table frame (n, 3) [m]; the run-out turns with the spindle.
+
+        positions : (n, k); times : (n,) [ns]
+        """
         cosine, sine = np.cos(positions[:, -1]), np.sin(positions[:, -1])
         x, y = self.truth.runout
         runout = np.column_stack([x * cosine - y * sine, x * sine + y * cosine, 0.0 * sine])
-        return sphere_in_table(self.truth.machine, positions[:, :-1], self.truth.errors, runout)
+        errors = self.truth.errors
+        if self.truth.warming is not None:
+            errors = WarmErrors(errors, self.truth.warming, self._warm_for(times))
+        return sphere_in_table(self.truth.machine, positions[:, :-1], errors, runout)
+
+    def _warm_for(self, times: np.ndarray) -> np.ndarray:
+        """How long the heat has been on at these times [s], negative before."""
+        if self._warm_from is None:
+            return np.full(len(times), -1.0)
+        return (times - self._warm_from) * 1e-9
+
+    def _to_sphere(self, positions: np.ndarray) -> np.ndarray:
+        """(n, 3, 3) from the table to the sphere, which turns with the spindle; nominal."""
+        machine = self.truth.machine
+        spindle = turn(np.array([0.0, 0.0, 1.0]), -positions[:, -1])[:, :3, :3]
+        return spindle @ table_to_spindle(machine, positions[:, :-1])
+
+    def _velocity(self, times: np.ndarray, positions: np.ndarray) -> np.ndarray:
+        """(n, 3) how the linear axes carry the sphere, frame ``table`` [m/s]."""
+        machine = self.truth.machine
+        linear = [machine.letters.index(name) for name in machine.linear]
+        ends = []
+        for step in (-_HALF_SPAN, _HALF_SPAN):
+            moved = positions[:, :-1].copy()
+            moved[:, linear] = self._timeline.at(times + step).positions[:, linear]
+            ends.append(sphere_in_table(machine, moved))
+        return (ends[1] - ends[0]) / (2e-9 * _HALF_SPAN)
 
     def _spoil(
         self, times: np.ndarray, values: np.ndarray, status: np.ndarray
@@ -252,12 +343,13 @@ class Cell:
                 values[rows, which], status[rows, which] = 0.0, Status.DEVICE_ERROR
         return values, status
 
-    def _read_encoders(self, feedback: list[Feedback]) -> None:
+    def _read_encoders(self, feedback: list[Feedback], wait: Wait) -> None:
         data = self.truth.encoders
         complete = (self.now - self.epoch) // data.period
         if complete <= self._feedback:
             return
-        times = self.epoch + (np.arange(self._feedback, complete) + 1) * data.period
+        numbers = self._wanted(np.arange(self._feedback, complete), data.period, wait)
+        times = self.epoch + (numbers + 1) * data.period
         machine = self.truth.machine
         noise = [
             data.rotary_noise if machine.axes[name].rotary else data.linear_noise
@@ -267,6 +359,13 @@ class Cell:
         positions += self._encoder_noise.standard_normal(positions.shape) * [
             *noise, data.rotary_noise
         ]
+        step = np.array([
+            data.rotary_step if name == SPINDLE or machine.axes[name].rotary else data.linear_step
+            for name in self.axes
+        ])
+        if step.any():
+            stepped = np.round(positions / np.where(step, step, 1.0)) * step
+            positions = np.where(step, stepped, positions)
         stale = self._active('feedback_stale', times)
         silent = self._active('feedback_silent', times)
         for index, time in enumerate(times):
@@ -277,6 +376,25 @@ class Cell:
                 feedback.append(self._latest)
         self._feedback = complete
 
+    def _read_thermometers(self, temperatures: list[Temperature]) -> None:
+        warming = self.truth.warming
+        if warming is None:
+            return
+        complete = (self.now - self.epoch) // warming.period
+        times = self.epoch + (np.arange(self._temperatures, complete) + 1) * warming.period
+        noise = warming.noise * self._thermometer_noise.standard_normal(
+            (len(times), len(warming.sensors))
+        )
+        seconds = self._warm_for(times)
+        for column, sensor in enumerate(warming.sensors.values()):
+            noise[:, column] += warming.value(sensor, seconds)
+        temperatures += [
+            Temperature(int(time), name, float(value), warming.noise**2)
+            for time, row in zip(times, noise, strict=True)
+            for name, value in zip(warming.sensors, row, strict=True)
+        ]
+        self._temperatures = complete
+
 
 def check(plan: CyclePlan, truth: Truth) -> None:
     """Refuse a plan the simulated machine cannot do.
@@ -284,9 +402,17 @@ def check(plan: CyclePlan, truth: Truth) -> None:
     Raises UserError naming cycle, axis, pose and what is expected.
     """
     where = f'plan {plan.cycle!r}'
-    if plan.kind is Kind.DYNAMIC:
-        raise UserError(f'{where}: the simulated cell does static cycles, not dynamic ones')
     axes = truth.machine.axes
+    if turns(plan):
+        turned = [k for k, name in enumerate(plan.axes) if name in axes and axes[name].rotary]
+        steps = np.abs(np.diff(plan.commands[:, turned], axis=0))
+        if not plan.feed > 0.0 or steps.max(axis=1).min() < 1e-9:
+            raise UserError(
+                f'{where}: a dynamic cycle turns a rotary axis between all of its poses, with a '
+                'feed, or none between any'
+            )
+    elif plan.kind is Kind.DYNAMIC and not plan.feed > 0.0:
+        raise UserError(f'{where}: a dynamic cycle has a feed')
     for column, name in enumerate(plan.axes):
         if name == SPINDLE:
             continue

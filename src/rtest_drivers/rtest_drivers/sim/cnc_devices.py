@@ -157,7 +157,7 @@ class OpcUaServer:
         self._nodes, self._variables = nodes, {}
         self.port = port or _free_port()
         self._loop = asyncio.new_event_loop()
-        self._thread = threading.Thread(target=self._loop.run_forever)
+        self._thread = threading.Thread(target=self._loop.run_forever, daemon=True)
         self._thread.start()
         self._run(self._start())
 
@@ -172,6 +172,31 @@ class OpcUaServer:
         """Change values, with a source time stamp [s] (now) and the name of a bad status."""
         self._run(self._write(values, time.time() if stamp is None else stamp, bad))
 
+    def end_subscriptions(self) -> None:
+        """Delete every subscription without telling, as after a fault of the server."""
+        service = self._server.iserver.subscription_service
+        self._run(service.delete_subscriptions(list(service.subscriptions)))
+
+    def stop_publishing(self) -> None:
+        """Subscriptions stay, nothing of them is published any more."""
+
+        async def cancel() -> None:
+            for one in self._server.iserver.subscription_service.subscriptions.values():
+                one._task.cancel()
+
+        self._run(cancel())
+
+    def state(self, value: int) -> None:
+        """Change the server's state, 0 for running."""
+        from asyncua import ua
+
+        node = self._server.get_node(ua.NodeId(ua.ObjectIds.Server_ServerStatus_State))
+        self._run(node.write_value(ua.DataValue(ua.Variant(value, ua.VariantType.Int32))))
+
+    def freeze(self, seconds: float) -> None:
+        """Do nothing for some time, with every connection open; returns at once."""
+        self._loop.call_soon_threadsafe(time.sleep, seconds)
+
     def close(self) -> None:
         """End."""
         self._run(self._end())
@@ -180,7 +205,7 @@ class OpcUaServer:
         self._loop.close()
 
     def _run(self, work: Any) -> Any:
-        return asyncio.run_coroutine_threadsafe(work, self._loop).result(10.0)
+        return asyncio.run_coroutine_threadsafe(work, self._loop).result(60.0)
 
     async def _start(self) -> None:
         from asyncua import Server, ua

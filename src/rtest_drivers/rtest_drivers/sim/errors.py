@@ -188,7 +188,7 @@ def parse_errors(fields: Fields, machine: Machine) -> GeometricErrors:
         for unit, scale in units.items():
             where = f'{fields.where}: {section}_{unit}'
             for text, value in fields.items(f'{section}_{unit}'):
-                symbol = _symbol(text, machine, where)
+                symbol = known_symbol(text, machine, where)
                 if not symbol.location or machine.axes[symbol.axis].rotary is not rotary:
                     kind = 'rotary' if rotary else 'linear'
                     raise UserError(
@@ -201,7 +201,7 @@ def parse_errors(fields: Fields, machine: Machine) -> GeometricErrors:
     terms: dict[str, tuple[Term, ...]] = {}
     where = f'{fields.where}: position_dependent'
     for text, value in fields.items('position_dependent'):
-        symbol = _symbol(text, machine, where)
+        symbol = known_symbol(text, machine, where)
         if symbol.location:
             raise UserError(f'{where}: {text}: a location error; expected as E_X(B)C')
         _once(symbol, terms, where)
@@ -218,7 +218,8 @@ def _once(symbol: Symbol, known: Mapping[str, object], where: str) -> None:
             raise UserError(f'{where}: {symbol.text}: given already as {text}')
 
 
-def _symbol(text: str, machine: Machine, where: str) -> Symbol:
+def known_symbol(text: str, machine: Machine, where: str) -> Symbol:
+    """Take a symbol apart; raises UserError where the machine has no such axis."""
     symbol = split(text, where)
     reference = text[text.index('(') + 1 : text.index(')')].lstrip('0') if '(' in text else None
     for letter in (symbol.axis, reference):
@@ -243,20 +244,24 @@ def _term(fields: Fields, symbol: Symbol, machine: Machine) -> Term:
         if not axis.rotary:
             raise UserError(f'{fields.where}: harmonic: {axis.name} does not turn, expected power')
         order = fields.integer('harmonic', lower=1)
-        cosine = _amplitude(fields, 'cos', symbol, optional=True)
-        sine = _amplitude(fields, 'sin', symbol, optional=True)
+        cosine = amplitude(fields, 'cos', symbol, optional=True)
+        sine = amplitude(fields, 'sin', symbol, optional=True)
         term = Term('harmonic', axis.name, order, cosine, sine, times=times)
     elif 'power' in fields:
         order = fields.integer('power', lower=1)
-        size = _amplitude(fields, f'at_{full_name}', symbol)
+        size = amplitude(fields, f'at_{full_name}', symbol)
         term = Term('power', axis.name, order, size, full=full, times=times)
     else:
-        term = Term('power', axis.name, 0, _amplitude(fields, 'constant', symbol), times=times)
+        term = Term('power', axis.name, 0, amplitude(fields, 'constant', symbol), times=times)
     fields.done()
     return term
 
 
-def _amplitude(fields: Fields, name: str, symbol: Symbol, optional: bool = False) -> float:
+def amplitude(fields: Fields, name: str, symbol: Symbol, optional: bool = False) -> float:
+    """A size under the key NAME_UNIT with a unit that fits the symbol [m] or [rad].
+
+    Raises UserError where there is none, unless it is optional, and where there are several.
+    """
     given = [unit for unit in symbol.units if f'{name}_{unit}' in fields]
     if len(given) > 1 or not (given or optional):
         wanted = ' or '.join(f'{name}_{unit}' for unit in symbol.units)

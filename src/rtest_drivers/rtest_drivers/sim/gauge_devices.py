@@ -135,7 +135,8 @@ class Nd287(Emulator):
                 return b'+    0.0000 ?  \r\n'
             return (b'-' if value < 0.0 else b'+') + b'%10.4f    \r\n' % abs(value)
         if question == b'\x1bA0200':
-            return b'\x02%+010d\r\n' % round(value * 1e4)
+            # The manual gives no answer for a gauge without signal.
+            return b'\x02%+010d\r\n' % round(value * 1e4) if math.isfinite(value) else b'\x15'
         return b'\x15'
 
     def wrong(self, question: bytes) -> bytes:
@@ -175,6 +176,8 @@ class Digimatic(Emulator):
 
     def answer(self, question: bytes) -> bytes:
         """The reading."""
+        if not math.isfinite(self.read()[0]):
+            return self.error(question)
         value = round(self.read()[0] * 1e6)
         return b'FFFF%d%06d30\r\n' % (8 if value < 0 else 0, abs(value))
 

@@ -81,6 +81,19 @@ def sphere_in_table(
     return np.einsum('nji,nj->ni', table[:, :3, :3], sphere - table[:, :3, 3])
 
 
+def table_to_spindle(machine: Machine, positions: np.ndarray) -> np.ndarray:
+    """(n, 3, 3) nominal rotations from the table to the last tool-side axis.
+
+    positions : (n, k) in the order of ``machine.letters`` [m] or [rad]
+    """
+    by_axis = {name: positions[:, k] for k, name in enumerate(machine.letters)}
+    table, tool = (
+        _side(machine, names, by_axis, NO_ERRORS)[:, :3, :3]
+        for names in (machine.table_side, machine.tool_side)
+    )
+    return np.swapaxes(tool, 1, 2) @ table
+
+
 def _side(
     machine: Machine,
     names: tuple[str, ...],

@@ -127,9 +127,17 @@ class LaserNest:
         rng: np.random.Generator,
         to_sphere: np.ndarray | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
+        """As `measure`, with noise of the sensor's size drawn from `rng`."""
+        noise = self.sensor.noise * rng.standard_normal((len(sphere), len(self.beams)))
+        return self.measure(sphere, noise, to_sphere)
+
+    def measure(
+        self, sphere: np.ndarray, noise: np.ndarray, to_sphere: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Readings (n, lasers) [m] and status (n, lasers) uint8 of sphere centres (n, 3).
 
         sphere : frame ``table`` [m]
+        noise : (n, lasers) that changes from reading to reading [m]
         to_sphere : (n, 3, 3) or (3, 3) rotation from ``table`` to the sphere, whose surface
             carries the speckle; by default the sphere turns with the table
 
@@ -141,7 +149,7 @@ class LaserNest:
         reading += sensor.defocus * sine * distance
         if sensor.speckle:
             reading += self._speckle(normal, to_sphere)
-        reading += sensor.noise * rng.standard_normal(reading.shape)
+        reading += noise
         held = np.clip(reading, sensor.lower, sensor.upper)
         across = normal - _dot(normal, self.directions)[..., None] * self.directions
         lost = ~(_dot(across, across) <= sensor.steepest**2)

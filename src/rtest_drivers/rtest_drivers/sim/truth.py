@@ -17,9 +17,11 @@ import numpy as np
 from rtest_drivers.sim.errors import GeometricErrors, parse_errors
 from rtest_drivers.sim.faults import Fault, parse_faults
 from rtest_drivers.sim.fields import Fields, read_yaml
-from rtest_drivers.sim.gauges import GaugeData
+from rtest_drivers.sim.gauges import GaugeData, LaserData
+from rtest_drivers.sim.laser import SENSORS
 from rtest_drivers.sim.model import load_motions
 from rtest_drivers.sim.motion import Drives
+from rtest_drivers.sim.warming import Warming, parse_warming
 from rtest_estimation.errors import UserError
 from rtest_identification.machine import Machine, load_machine
 
@@ -28,11 +30,13 @@ _UM, _MS, _DEG, _MM = 1e-6, 1e-3, math.pi / 180.0, 1e-3
 
 @dataclass(frozen=True)
 class Encoders:
-    """Encoder feedback: period [ns], white noise of linear [m] and rotary axes [rad]."""
+    """Encoder feedback: period [ns]; of linear [m] and rotary axes [rad] white noise and steps."""
 
     period: int
     linear_noise: float
     rotary_noise: float
+    linear_step: float = 0.0
+    rotary_step: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -41,6 +45,9 @@ class Truth:
 
     runout : (2,) sphere off the spindle axis at S = 0, along X and Y of the tool [m]
     remount : time a change of the set-up takes [s]
+    warming : None for a machine that stays as it is
+    thin : while it waits long for the next cycle gauges and encoders are read so often only, and
+        time may pass as fast as it can [ns]; 0 for always as usual
     """
 
     machine: Machine
@@ -52,6 +59,8 @@ class Truth:
     remount: float
     seed: int
     faults: tuple[Fault, ...] = ()
+    warming: Warming | None = None
+    thin: int = 0
 
 
 def load_truth(path: Path | str) -> Truth:
@@ -80,6 +89,8 @@ def load_truth(path: Path | str) -> Truth:
         remount=fields.number('remount_s', 1.0, 0.0),
         seed=fields.integer('seed'),
         faults=parse_faults(fields, len(gauges.tilt)),
+        warming=parse_warming(fields, machine),
+        thin=round(1e9 * fields.number('waiting_read_every_s', 0.0, 0.0)),
     )
     fields.done()
     return truth
@@ -93,16 +104,29 @@ def _gauges(fields: Fields) -> GaugeData:
     tilt = np.array([entry.number('tilt_deg', scale=_DEG) for entry in entries])
     for entry in entries:
         entry.done()
-    lower, upper = fields.numbers('range_mm', 2, _MM)
-    if not lower < 0.0 < upper:
-        raise UserError(f'{fields.where}: range_mm: expected [lower, upper] around 0')
-    outliers = fields.section('outliers')
+    sensor = fields.choice('sensor', SENSORS, None)
+    lasers, position_error = None, 0.0
+    if sensor is None:
+        lower, upper = fields.numbers('range_mm', 2, _MM)
+        if not lower < 0.0 < upper:
+            raise UserError(f'{fields.where}: range_mm: expected [lower, upper] around 0')
+        position_error = fields.number('position_error_um', 0.0, 0.0, _UM)
+        noise = fields.number('noise_um', 0.0, 0.0, _UM)
+    else:
+        lasers = LaserData(
+            SENSORS[sensor],
+            fields.number('sphere_radius_mm', lower=1.0, scale=_MM),
+            fields.number('aim_error_um', 0.0, 0.0, _UM),
+            fields.number('distance_error_um', 0.0, 0.0, _UM),
+        )
+        lower, upper, noise = lasers.sensor.lower, lasers.sensor.upper, lasers.sensor.noise
+    outliers, friction = fields.section('outliers'), fields.section('friction')
     data = GaugeData(
         azimuth,
         tilt,
         fields.number('direction_error_deg', 0.0, 0.0, _DEG),
-        fields.number('position_error_um', 0.0, 0.0, _UM),
-        fields.number('noise_um', 0.0, 0.0, _UM),
+        position_error,
+        noise,
         fields.number('dwell_noise_um', 0.0, 0.0, _UM),
         lower,
         upper,
@@ -110,8 +134,14 @@ def _gauges(fields: Fields) -> GaugeData:
         fields.integer('batch', 1, lower=1),
         outliers.number('share', 0.0, 0.0),
         outliers.number('size_um', 0.0, 0.0, _UM),
+        lasers,
+        fields.number('late_ms', 0.0, scale=_MS),
+        friction.number('lag_um', 0.0, 0.0, _UM),
+        friction.number('speed_mm_s', 10.0, 0.01, _MM),
+        friction.number('power', 0.0),
     )
     outliers.done()
+    friction.done()
     fields.done()
     if np.linalg.matrix_rank(data.directions, tol=1e-3) < 3:
         raise UserError(f'{fields.where}: directions: expected three that span the space')
@@ -123,6 +153,8 @@ def _encoders(fields: Fields) -> Encoders:
         _period(fields),
         fields.number('linear_noise_um', 0.0, 0.0, _UM),
         fields.number('rotary_noise_urad', 0.0, 0.0, 1e-6),
+        fields.number('linear_step_um', 0.0, 0.0, _UM),
+        fields.number('rotary_step_urad', 0.0, 0.0, 1e-6),
     )
     fields.done()
     return encoders
@@ -130,7 +162,7 @@ def _encoders(fields: Fields) -> Encoders:
 
 def _drives(fields: Fields) -> Drives:
     base = Drives()
-    settle = fields.section('settle')
+    settle, lag, start = (fields.section(name) for name in ('settle', 'lag', 'start'))
     drives = Drives(
         fields.number('linear_mm_s', base.linear, 1.0, _MM),
         fields.number('rotary_deg_s', base.rotary, 1.0, _DEG),
@@ -138,8 +170,15 @@ def _drives(fields: Fields) -> Drives:
         settle.number('amplitude_um', base.settle, 0.0, _UM),
         settle.number('frequency_hz', base.frequency, 1.0),
         settle.number('decay_ms', base.decay, 0.1, _MS),
+        fields.number('rotary_deg_s2', base.acceleration, 1.0, _DEG),
+        lag.number('linear_ms', 0.0, 0.0, _MS),
+        lag.number('rotary_ms', 0.0, 0.0, _MS),
+        start.number('way_ms', 0.0, 0.0, _MS),
+        start.number('frequency_hz', base.start_frequency, 1.0),
+        start.number('decay_ms', base.start_decay, 0.1, _MS),
     )
-    settle.done()
+    for section in (settle, lag, start):
+        section.done()
     fields.done()
     return drives
 

@@ -114,11 +114,7 @@ def leave_one_out(nodes: np.ndarray, values: np.ndarray, kernel: Kernel) -> np.n
     scaled = (nodes - middle) / half
     distance = np.linalg.norm(scaled[:, np.newaxis] - scaled, axis=2)
     count = len(nodes)
-    powers = [
-        np.prod(scaled[:, list(columns)], axis=1)
-        for degree in range(kernel.degree + 1)
-        for columns in combinations_with_replacement(range(3), degree)
-    ]
+    powers = _powers(scaled, kernel.degree)
     size = count + len(powers)
     if count <= len(powers):
         return None
@@ -148,6 +144,31 @@ def compare(nodes: np.ndarray, values: np.ndarray) -> list[tuple[Kernel, float]]
         if errors is not None:
             found.append((kernel, _rms(errors)))
     return sorted(found, key=lambda pair: pair[1])
+
+
+def local_scatter(nodes: np.ndarray, values: np.ndarray) -> tuple[float, int]:
+    """What no smooth correction can know: standard deviation per component [m], freedom.
+
+    Scatter of the correction about a polynomial of the second degree: speckle, noise and the
+    machine's positioning. On the 27 points of a cube a little of the inclination error is in it.
+    NaN and 0 where there are no more nodes than the polynomial has terms.
+    """
+    middle, half = _scaling(nodes)
+    powers = np.column_stack(_powers((nodes - middle) / half, 2))
+    freedom = len(nodes) - powers.shape[1]
+    if freedom < 1:
+        return float('nan'), 0
+    left = values - powers @ np.linalg.lstsq(powers, values, rcond=None)[0]
+    return float(np.sqrt((left**2).sum() / (3 * freedom))), 3 * freedom
+
+
+def _powers(scaled: np.ndarray, degree: int) -> list[np.ndarray]:
+    """(n,) each: products of the coordinates up to a degree; none for degree -1."""
+    return [
+        np.prod(scaled[:, list(columns)], axis=1)
+        for order in range(degree + 1)
+        for columns in combinations_with_replacement(range(3), order)
+    ]
 
 
 def _rms(vectors: np.ndarray) -> float:

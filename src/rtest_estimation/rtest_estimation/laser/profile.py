@@ -110,12 +110,19 @@ def _best_sphere(
 ) -> tuple[np.ndarray, float]:
     """Top (2,) and height of the least-squares sphere."""
     highest = int(np.argmax(value))
+    first, height = place[highest], float(value[highest])
 
+    # Unknown is the way from the first guess: a step is limited by the size of what it starts
+    # from, which must be zero and not next to it.
     def misfit(unknown: np.ndarray) -> np.ndarray:
-        return value - _sphere(place, unknown[:2], unknown[2], radius)
+        return value - _sphere(place, first + unknown[:2], height + unknown[2], radius)
 
-    start = [*place[highest], value[highest]]
-    found = least_squares(misfit, start, method='lm', x_scale='jac')
+    def slope(unknown: np.ndarray) -> np.ndarray:
+        across = place - first - unknown[:2]
+        rise = np.sqrt(np.maximum(radius**2 - (across**2).sum(axis=1), (0.1 * radius) ** 2))
+        return -np.column_stack([across / rise[:, np.newaxis], np.ones(len(place))])
+
+    found = least_squares(misfit, np.zeros(3), slope, method='lm', x_scale='jac')
     if not found.success:
         raise ValueError(f'the readings fit no sphere of {radius * 1e3:.3f} mm radius')
-    return found.x[:2], float(found.x[2])
+    return first + found.x[:2], height + float(found.x[2])

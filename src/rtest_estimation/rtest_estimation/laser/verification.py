@@ -28,12 +28,14 @@ class Verification:
     raw : without correction; corrected : with it. Both over the positions whose centre is valid;
         None where there is none
     error : (n, 3) estimated minus commanded position [m], NaN where there is no centre
+    raw_error : the same without correction
     status : (n,) `CentreStatus`
     """
 
     raw: Deviation | None
     corrected: Deviation | None
     error: np.ndarray
+    raw_error: np.ndarray
     status: np.ndarray
 
     def count(self, status: CentreStatus) -> int:
@@ -58,12 +60,13 @@ def verify(solver: CentreSolver, positions: np.ndarray, readings: np.ndarray) ->
     raw, _ = solver.geometric(readings)
     valid = status == CentreStatus.VALID
     return Verification(
-        _deviation((raw - positions)[valid]), _deviation((found - positions)[valid]),
-        found - positions, status,
+        deviation((raw - positions)[valid]), deviation((found - positions)[valid]),
+        found - positions, raw - positions, status,
     )
 
 
-def _deviation(error: np.ndarray) -> Deviation | None:
+def deviation(error: np.ndarray) -> Deviation | None:
+    """Deviation of errors (n, 3) [m]; None where there is none."""
     if not len(error):
         return None
     distance = np.linalg.norm(error, axis=1)

@@ -72,5 +72,8 @@ def nest_calibration(nest: NestCalibration) -> msg.NestCalibration:
         kind=int(nest.kind),
         sphere_radius=nest.sphere_radius,
         direction=nest.direction.ravel().tolist(),
+        spot=nest.spot.ravel().tolist(),
+        correction_nodes=nest.correction_nodes.ravel().tolist(),
+        correction_values=nest.correction_values.ravel().tolist(),
         residual=nest.residual,
     )

@@ -6,8 +6,23 @@ import signal
 from collections.abc import Callable
 
 import rclpy
+from rclpy.clock import JumpHandle, JumpThreshold
+from rclpy.duration import Duration
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
+
+# A clock that goes back further than this was set back: a replay begins anew [s].
+_BACK_S = 0.5
+
+
+def when_time_goes_back(node: Node, begin_anew: Callable[[], None]) -> JumpHandle:
+    """Call `begin_anew` when the /clock that the node follows goes back; keep what is returned."""
+    threshold = JumpThreshold(
+        min_forward=None, min_backward=Duration(seconds=-_BACK_S), on_clock_change=False
+    )
+    return node.get_clock().create_jump_callback(
+        threshold, post_callback=lambda _: begin_anew()
+    )
 
 
 def run(make: Callable[[], Node], args: list[str] | None = None) -> int:

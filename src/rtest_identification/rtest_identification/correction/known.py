@@ -49,6 +49,19 @@ class KnownErrors:
     spread: Callable[[np.ndarray], np.ndarray] | None = None
     notes: tuple[str, ...] = ()
 
+    def named(
+        self, positions: np.ndarray, approach: np.ndarray, name: Callable[[int], str]
+    ) -> np.ndarray:
+        """As `at`; the UserError of a pose outside the measured stations starts with its name."""
+        inside = self.inside(positions)
+        if not inside.all():
+            row = int(np.argmin(inside))
+            try:
+                self.at(positions[row : row + 1], approach[row : row + 1])
+            except UserError as error:
+                raise UserError(f'{name(row)}: {error}') from None
+        return self.at(positions, approach)
+
 
 def of_file(path: Path, machine: Machine) -> KnownErrors:
     """Of an identification.json.

@@ -13,7 +13,7 @@ import numpy as np
 
 from rtest_identification.correction.compensation import AxisTable, ini_text
 from rtest_identification.correction.known import KnownErrors
-from rtest_identification.correction.step import Correction, Deviation
+from rtest_identification.correction.step import Correction, Deviation, axis_slopes
 from rtest_identification.correction.table import Table
 from rtest_identification.machine import Machine
 
@@ -48,6 +48,8 @@ class Remains:
 class Judged:
     """What a correction is predicted to do.
 
+    placed : rms of the tool point's shift before, less what one constant shift of the linear axes
+        takes away, which is what a workpiece zero does [m]
     spread : what the tool point is uncertain by, rms [m]; None where it is not known
     near_pole : poses where a part of the tilt is left on purpose
     """
@@ -55,6 +57,7 @@ class Judged:
     poses: int
     before: Remains
     after: Remains
+    placed: float
     spread: float | None
     near_pole: int
 
@@ -67,8 +70,8 @@ def judge(known: KnownErrors, correction: Correction) -> Judged:
         values = values[np.isfinite(values)]
         spread = float(np.sqrt(np.mean(values**2))) if len(values) else None
     return Judged(
-        len(correction.nominal), remains(correction.before), remains(correction.after), spread,
-        int(correction.near_pole.sum()),
+        len(correction.nominal), remains(correction.before), remains(correction.after),
+        _placed(correction), spread, int(correction.near_pole.sum()),
     )
 
 
@@ -80,15 +83,25 @@ def remains(one: Deviation) -> Remains:
     return Remains(*found)
 
 
-def summary(what: str, judged: Judged) -> str:
-    """One line: what is predicted before and after."""
+def _placed(correction: Correction) -> float:
+    machine, shift = correction.machine, correction.before.shift
+    linear = [k for k, name in enumerate(machine.letters) if not machine.axes[name].rotary]
+    slope = axis_slopes(machine, correction.nominal)[0][:, :, linear].reshape(-1, len(linear))
+    zero = np.linalg.lstsq(slope, shift.ravel(), rcond=None)[0]
+    left = (shift.ravel() - slope @ zero).reshape(shift.shape)
+    return float(np.sqrt(np.mean((left**2).sum(axis=1))))
+
+
+def summary(what: str, judged: Judged, counted: str = 'poses') -> str:
+    """One line: what is predicted before and after. counted : what the poses are."""
     before, after = judged.before, judged.after
     known = '' if judged.spread is None else (
         f' (the errors are known to {judged.spread * 1e6:.2f} µm, k = 1)'
     )
     return (
-        f'{what}: {judged.poses} poses, tool point {before.shift * 1e6:.2f} -> '
-        f'{after.shift * 1e6:.3f} µm rms as predicted{known}, tilt of the tool '
+        f'{what}: {judged.poses} {counted}, tool point {before.shift * 1e6:.2f} (but for a '
+        f'constant offset {judged.placed * 1e6:.2f}) -> {after.shift * 1e6:.3f} µm rms, '
+        f'{after.shift_largest * 1e6:.3f} at most, as predicted{known}, tilt of the tool '
         f'{before.tilt * 1e6:.2f} -> {after.tilt * 1e6:.2f} µrad'
     )
 

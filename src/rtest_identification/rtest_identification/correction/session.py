@@ -28,7 +28,10 @@ def correct_plan(known: KnownErrors, plan: CyclePlan) -> tuple[CyclePlan, Correc
     count = len(known.machine.letters)
     nominal = plan.commands[:, :count]
     path = synchronous_path(known.machine, plan)
-    correction = correct(known.machine, nominal, known.at(nominal, path.signs()[:, :count]))
+    errors = known.named(
+        nominal, path.signs()[:, :count], lambda row: f'{plan.cycle}: pose {row}'
+    )
+    correction = correct(known.machine, nominal, errors)
     commands = np.column_stack([correction.positions, plan.commands[:, count:]])
     return replace(plan, cycle=f'{plan.cycle}-corrected', commands=commands), correction
 

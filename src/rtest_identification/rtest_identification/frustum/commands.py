@@ -31,6 +31,8 @@ _TURN = 2.0 * np.pi
 # Nearer to it than this, the tool axis is along the first rotary axis, whose position is then
 # anything; to rounding a direction is out of reach.
 _ALONG, _ROUNDING = 1e-9, 1e-12
+# Sine of the angle between them below which that axis turns fast: 5 deg.
+_POLE = np.sin(np.radians(5.0))
 
 
 @dataclass(frozen=True)
@@ -39,12 +41,20 @@ class Commands:
 
     positions : (n, k) in the order of ``machine.letters`` [m] or [rad], rotary axes unwrapped
     notes : what a person should know: axes out of their range
+    lines : (n,) of the file that each point is from, counted from 1; empty where there is none
     """
 
     machine: Machine
     feature: Feature
     positions: np.ndarray
     notes: tuple[str, ...] = ()
+    lines: tuple[int, ...] = ()
+
+    def where(self, row: int) -> str:
+        """What a person finds a point by."""
+        if self.lines:
+            return f'{self.feature.name}:{self.lines[row]}'
+        return f'{self.feature.name}: point {row + 1}'
 
     def axis(self, name: str) -> np.ndarray:
         """(n,) positions of one axis."""
@@ -86,7 +96,8 @@ def command(
         positions = min(found, key=lambda positions: _misses(machine, positions, inside))
     else:
         positions = found[0 if solution == NEGATIVE else 1]
-    return Commands(machine, feature, positions, tuple(out_of_range(machine, positions)))
+    notes = (*out_of_range(machine, positions).values(), *near_pole(machine, feature, positions))
+    return Commands(machine, feature, positions, notes)
 
 
 def tool_axis(machine: Machine, positions: np.ndarray) -> np.ndarray:
@@ -99,19 +110,41 @@ def tool_axis(machine: Machine, positions: np.ndarray) -> np.ndarray:
     return axis
 
 
-def out_of_range(machine: Machine, positions: np.ndarray) -> list[str]:
-    """Axes that leave their range, in words."""
-    notes = []
+def out_of_range(machine: Machine, positions: np.ndarray) -> dict[str, str]:
+    """Axes that leave their range, and that in words."""
+    notes = {}
     for name, column in zip(machine.letters, positions.T, strict=True):
         axis = machine.axes[name]
         scale, unit = (180.0 / np.pi, 'deg') if axis.rotary else (1e3, 'mm')
-        if column.min() < axis.lower - 1e-9 or column.max() > axis.upper + 1e-9:
-            notes.append(
-                f'{name} goes from {column.min() * scale:.1f} to {column.max() * scale:.1f} '
+        low, high = column.min(), column.max()
+        beyond = max(axis.lower - low, high - axis.upper)
+        if beyond > 1e-9:
+            # What is little too much must be seen.
+            digits = 1 if beyond * scale > 0.1 else 4
+            notes[name] = (
+                f'{name} goes from {low * scale:.{digits}f} to {high * scale:.{digits}f} '
                 f'{unit}, its range is {axis.lower * scale:g} to {axis.upper * scale:g}: the '
                 'machine cannot run this path as it is placed'
             )
     return notes
+
+
+def near_pole(machine: Machine, feature: Feature, positions: np.ndarray) -> list[str]:
+    """Where the tool comes so near to the axis next to the table that this must turn fast."""
+    (name, _), first, _ = _pair(machine)
+    sine = np.linalg.norm(np.cross(feature.axis, first), axis=1)
+    nearest = int(np.argmin(sine))
+    turn = np.abs(np.diff(positions[:, machine.letters.index(name)]))
+    way = np.linalg.norm(np.diff(feature.tip, axis=0), axis=1)
+    if sine[nearest] >= _POLE or not turn.any():
+        return []
+    rate = np.degrees(turn / np.maximum(way * 1e3, 1e-3)).max()
+    return [
+        f'at point {nearest + 1} the tool comes within {np.degrees(np.arcsin(sine[nearest])):.2g} '
+        f'deg of a pole (along {name}): {name} turns by up to {rate:.3g} deg per mm of path; '
+        'where that is faster than it can, the feed is not kept, and a small change of the path '
+        'changes the commands much'
+    ]
 
 
 def _pair(machine: Machine) -> tuple[tuple[str, str], np.ndarray, np.ndarray]:
@@ -214,5 +247,5 @@ def _misses(
     machine: Machine, positions: np.ndarray, inside: Callable[[np.ndarray], np.ndarray] | None
 ) -> tuple[int, ...]:
     """How many rotary ranges are left, then how many points are not inside."""
-    rotary = sum(note.split()[0] in machine.rotary for note in out_of_range(machine, positions))
+    rotary = sum(name in machine.rotary for name in out_of_range(machine, positions))
     return (rotary, 0 if inside is None else int((~inside(positions)).sum()))

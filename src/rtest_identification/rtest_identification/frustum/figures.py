@@ -105,7 +105,7 @@ def commands(made: Commands, feed: float) -> Figure:
         axes.set_ylabel(f'{name} [{"deg" if rotary else "mm"}]')
         axes.margins(y=0.12)
         axes.grid(alpha=0.3)
-    panels[-1].set_xlabel(f'time at {feed * 6e4:g} mm/min [s]')
+    panels[-1].set_xlabel(f'time if the tool keeps {feed * 6e4:g} mm/min on the part [s]')
     return figure
 
 
@@ -145,7 +145,8 @@ def contour(found: Prediction, cone: Frustum | None) -> Figure:
                   label='U (k = 2) of all errors')
         for values, colour, style, label in curves:
             axes.plot(*_around(cone, values, factor), style, color=colour, label=label)
-        axes.set_title(f'deviation magnified {times(factor)}', fontsize=9, loc='left')
+        axes.set_title(f'axes: mm of the part; deviations from the grey circle magnified '
+                       f'{times(factor)}: read them by the bar', fontsize=9, loc='left')
         axes.set_xlabel("x' across the cone's axis, in the plane of the tilt [mm]")
         axes.set_ylabel("y' [mm]")
     figure.legend(*axes.get_legend_handles_labels(), loc='outside lower center',
@@ -179,18 +180,24 @@ def profiles(cone: Frustum, named: Sequence[tuple[str, np.ndarray]]) -> Figure:
 def ranking(ranked: Sequence[Ranked], quantity: str) -> Figure:
     """What every error does alone, the largest on top."""
     shown = [one for one in ranked if one.alone > 5e-9][:_MOST_RANKED]
-    figure = Figure(figsize=(8.5, 0.9 + 0.27 * max(len(shown), 3)), layout='constrained')
+    figure = Figure(figsize=(10.0, 0.9 + 0.34 * max(len(shown), 3)), layout='constrained')
     axes = figure.subplots()
-    names = [f'{one.name}  ({one.size})' for one in shown]
+    axes.set_xlabel(f'{quantity} by this error alone [µm]')
+    if not shown:
+        axes.text(0.5, 0.5, 'no error makes 0.005 µm', ha='center', transform=axes.transAxes)
+        axes.set_yticks([])
+        return figure
+    names = [
+        f'{one.name}  ({one.size})' + (f'\n{one.formula}' if one.formula else '') for one in shown
+    ]
     colours = [_CONSTANT if one.constant else _VARYING for one in shown]
     values = [1e6 * one.alone for one in shown]
     axes.barh(range(len(shown)), values, color=colours, height=0.65)
     for place, value in enumerate(values):
         axes.annotate(f' {value:.2f}', (value, place), va='center', fontsize=8)
-    axes.set_yticks(range(len(shown)), names, fontsize=8)
+    axes.set_yticks(range(len(shown)), names, fontsize=7)
     axes.invert_yaxis()
-    axes.margins(x=0.1)
-    axes.set_xlabel(f'{quantity} by this error alone [µm]')
+    axes.margins(x=0.1, y=0.01)
     axes.grid(axis='x', alpha=0.3)
     for colour, label in ((_CONSTANT, 'constant'), (_VARYING, 'changes along the path')):
         if colour in colours:
@@ -211,8 +218,9 @@ def tables(lines: Sequence[Line]) -> Figure:
             axes.errorbar(
                 [1e6 * getattr(one, name) for one in chosen], place, xerr=spread,
                 fmt=SETUP_MARKERS[lane], color=('black', *SETUP_COLOURS)[lane], markersize=4,
-                linewidth=0.0, elinewidth=0.9, label=('paper', 'ours, least-squares circle',
-                                                      'ours, minimum-zone circle')[lane],
+                linewidth=0.0, elinewidth=0.9,
+                label=('as printed', 'computed, least-squares circle',
+                       'computed, minimum-zone circle')[lane],
             )
         axes.set_yticks(range(len(chosen)), [f'{one.table}  {one.name}' for one in chosen],
                         fontsize=8)
@@ -222,8 +230,11 @@ def tables(lines: Sequence[Line]) -> Figure:
         axes.set_title(f'({case}) φ {15 if case == "a" else 75}°, ψ 30°', fontsize=10)
         axes.set_xlabel('circularity [µm]')
         axes.grid(axis='x', alpha=0.3)
-    figure.legend(*panels[0].get_legend_handles_labels(), loc='outside lower center', ncols=3,
-                  fontsize=9, frameon=False)
+    figure.legend(
+        *panels[0].get_legend_handles_labels(), loc='outside lower center', ncols=3, fontsize=9,
+        frameon=False, title='point: mean over simulated machines; bar: their standard deviation, '
+        'how much machines differ, no uncertainty of the mean', title_fontsize=9,
+    )
     return figure
 
 
@@ -239,7 +250,7 @@ def _ring(axes: Axes, cone: Frustum, factor: float) -> None:
     """The nominal circle with its start and a scale bar of the deviations."""
     half = 0.5e3 * cone.diameter
     axes.plot(half * np.cos(_TURN), half * np.sin(_TURN), color='0.6', linewidth=0.9)
-    axes.plot(half, 0.0, '.', color='0.4')
+    axes.plot(half, 0.0, 'o', color='black', markersize=5, markeredgecolor='white', zorder=10)
     axes.set_aspect('equal')
     wide = 2.0 * half * (1.0 + 1.2 * _SHARE)
     axes.set_xlim(-0.5 * wide, 0.5 * wide)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -40,10 +41,12 @@ class Blocks:
     """Cutting moves of a program (G1), all axes going straight from start to end.
 
     start, end : (m, k) in the order of ``machine.letters`` [m] or [rad]
+    line : (m,) of the program, counted from 1
     """
 
     start: np.ndarray
     end: np.ndarray
+    line: tuple[int, ...]
 
 
 def read_blocks(path: Path, text: str, machine: Machine) -> Blocks:
@@ -54,22 +57,27 @@ def read_blocks(path: Path, text: str, machine: Machine) -> Blocks:
     scale = {n: math.pi / 180 if machine.axes[n].rotary else 1e-3 for n in machine.letters}
     position: dict[str, float] = {}
     cutting: bool | None = None
-    found = []
-    for number, line in enumerate(text.splitlines(), 1):
+    found, at = [], []
+    for number, words in executed(path, text):
         where = f'{path}:{number}'
-        words = _words(line, where)
         motion = [_MOTION[v] for letter, v in words if letter == 'G' and v in _MOTION]
         if len(motion) > 1:
-            raise UserError(f'{where}: G0 and G1 in one block')
+            raise UserError(f'{where}: two of G0 and G1 in one block; give each its own')
         cutting = motion[0] if motion else cutting
-        timed = ('G', 4.0) in words or ('G', 64.0) in words
+        dwell = ('G', 4.0) in words
+        timed = dwell or ('G', 64.0) in words
+        if dwell:
+            _check_dwell(words, scale, where)
         before = dict(position)
         for letter, value in words:
             if letter in 'GM':
                 _check_code(letter, value, where)
             elif letter in scale:
-                position[letter] = value * scale[letter]
-            elif letter not in _OTHER_WORDS and not (letter == 'P' and timed):
+                if not dwell:
+                    position[letter] = value * scale[letter]
+            elif letter not in _OTHER_WORDS and not (letter == 'P' and timed) and not (
+                letter == 'X' and dwell
+            ):
                 raise UserError(f'{where}: {letter}{value:g}: not one of the words expected here')
         if position != before:
             if cutting is None:
@@ -82,19 +90,34 @@ def read_blocks(path: Path, text: str, machine: Machine) -> Blocks:
                         'with G0 first'
                     )
                 found.append((before, dict(position)))
-        if any(letter == 'M' and v in _END_M for letter, v in words):
-            break
+                at.append(number)
     if not found:
         raise UserError(f'{path}: no cutting move (G1)')
     ends = np.array([[[p[name] for name in machine.letters] for p in pair] for pair in found])
-    return Blocks(ends[:, 0], ends[:, 1])
+    return Blocks(ends[:, 0], ends[:, 1], tuple(at))
 
 
-def _words(line: str, where: str) -> list[tuple[str, float]]:
-    """Letters with their numbers; nothing for an empty line, a comment or a percent sign."""
-    rest = _COMMENT.sub(' ', line).strip().upper()
-    if rest == '%':
-        return []
+def executed(path: Path, text: str) -> Iterator[tuple[int, list[tuple[str, float]]]]:
+    """Line, counted from 1, and words of every block up to the program's end.
+
+    The end is M2, M30 or a percent sign after a block. Raises UserError as `read_blocks` does.
+    """
+    begun = False
+    for number, line in enumerate(text.splitlines(), 1):
+        rest = _COMMENT.sub(' ', line).strip().upper()
+        if rest == '%':
+            if begun:
+                return
+            continue
+        words = _words(rest, f'{path}:{number}')
+        begun = begun or bool(words)
+        yield number, words
+        if any(letter == 'M' and v in _END_M for letter, v in words):
+            return
+
+
+def _words(rest: str, where: str) -> list[tuple[str, float]]:
+    """Letters with their numbers of a line without its comments."""
     words, at = [], 0
     while at < len(rest):
         match = _WORD.match(rest, at)
@@ -106,6 +129,15 @@ def _words(line: str, where: str) -> list[tuple[str, float]]:
         words.append((letter, value))
         at = match.end()
     return words
+
+
+def _check_dwell(words: list[tuple[str, float]], axes: dict[str, float], where: str) -> None:
+    """A dwell moves nothing: `G4 P` or, as some controllers have it, `G4 X` with its time."""
+    times = [letter for letter, _ in words if letter in axes or letter in 'PX']
+    if times not in ([], ['P'], ['X']) or any(('G', code) in words for code in _MOTION):
+        raise UserError(
+            f'{where}: a dwell (G4) in one block with a move; give P or X with its time alone'
+        )
 
 
 def _check_code(letter: str, value: float, where: str) -> None:

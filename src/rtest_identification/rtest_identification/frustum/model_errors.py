@@ -70,7 +70,8 @@ def of_model(
         moved, spreads = _moved(entry, effect, shape, scene)
         error = error + moved
         parts.append(Part(
-            entry.key, _sizes(entry), along_normal(commands, moved), None, False
+            entry.key, _sizes(entry), along_normal(commands, moved), None, False,
+            formula=effect.formula,
         ))
         spread += [along_normal(commands, one) for one in spreads]
     rng = np.random.default_rng(seed)

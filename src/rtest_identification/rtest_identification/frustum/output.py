@@ -47,6 +47,7 @@ def prediction_as_dict(found: Prediction, cone: Frustum | None) -> dict[str, Any
         'profile_stddev': found.profile_stddev.tolist(),
         'motions': found.motions,
         'ranking': ranking_as_list(found.ranking),
+        'not_determined': list(found.unknown),
         'notes': list(found.notes),
     }
 
@@ -108,7 +109,9 @@ def figures(found: Prediction) -> list[tuple[str, str, str, str]]:
 def lines(ranked: Sequence[Ranked], quantity: str) -> list[str]:
     """The errors that matter most, for a person."""
     told = [f'{quantity} by each error alone [µm]:']
-    told += [f'  {1e6 * one.alone:8.2f}  {one.name} ({one.size})' for one in ranked[:_PRINTED]]
+    for one in ranked[:_PRINTED]:
+        formula = f': {one.formula}' if one.formula else ''
+        told.append(f'  {1e6 * one.alone:8.2f}  {one.name} ({one.size}){formula}')
     rest = len(ranked) - _PRINTED
     return told + ([f'  and {rest} more in frustum.json'] if rest > 0 else [])
 
@@ -122,6 +125,8 @@ def summary(found: Prediction) -> str:
     )
     if form.zone is not None:
         text += f', minimum zone {form.zone * unit:.2f} µm, ball bar {form.bar * unit:.2f} µm'
+    if found.unknown:
+        text += f'; without {", ".join(found.unknown)}, not determined and in no value or U'
     return text
 
 

@@ -16,12 +16,20 @@ from __future__ import annotations
 
 import csv
 import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from rtest_estimation.errors import UserError
-from rtest_identification.frustum.commands import Commands, command, out_of_range, tool_axis
+from rtest_identification.frustum.commands import (
+    AUTO,
+    Commands,
+    command,
+    out_of_range,
+    tool_axis,
+)
 from rtest_identification.frustum.feature import Feature
 from rtest_identification.frustum.gcode import read_blocks
 from rtest_identification.kinematics import predict
@@ -41,48 +49,66 @@ _FEWEST, _MOST = 7, 20_000
 
 
 def load_path(
-    path: Path, machine: Machine, surface: str = LEFT, **choice: object
+    path: Path,
+    machine: Machine,
+    surface: str | None = None,
+    solution: str | None = None,
+    inside: Callable[[np.ndarray], np.ndarray] | None = None,
 ) -> Commands:
     """Read a path and command it on a machine.
 
-    surface : one of SURFACES, where the file has no normals
-    choice : `solution` and `inside` of `commands.command`, for paths of tip and axis
+    surface : one of SURFACES, where the file has no normals; LEFT where omitted
+    solution, inside : as in `commands.command`, for paths of tip and axis
 
     Raises UserError naming file, line and what is expected.
     """
-    if surface not in SURFACES:
+    if surface is not None and surface not in SURFACES:
         raise UserError(f'surface {surface!r}: expected one of {", ".join(SURFACES)}')
     try:
         text = path.read_text(encoding='utf-8-sig')
     except (OSError, UnicodeDecodeError) as error:
         raise UserError(f'{path}: cannot read the path: {error}') from None
     if path.suffix.lower() != '.csv':
-        return _program(path, text, machine, surface)
+        _refuse(path, solution)
+        return _program(path, text, machine, surface or LEFT)
     columns, lines = _table(path, text)
     given = _vectors(columns, _NORMAL, path, lines) if _NORMAL[0] in columns else None
+    if given is not None and surface is not None:
+        raise UserError(f'{path}: has normals, so --surface says nothing: leave one of them out')
+    axes = [f'{n}_{"deg" if machine.axes[n].rotary else "mm"}' for n in machine.letters]
     if set(_AXIS) <= set(columns):
-        _expect(path, columns, (*_TIP, *_AXIS))
+        _expect(path, columns, (*_TIP, *_AXIS), axes)
         tip = 1e-3 * np.stack([columns[name] for name in _TIP], axis=1)
         axis = _vectors(columns, _AXIS, path, lines)
-        feature = _feature(path, lines, tip, axis, given, surface)
-        return command(machine, feature, **choice)
-    names = [f'{n}_{"deg" if machine.axes[n].rotary else "mm"}' for n in machine.letters]
-    _expect(path, columns, names)
+        feature = _feature(path, lines, tip, axis, given, surface or LEFT)
+        return replace(command(machine, feature, solution or AUTO, inside), lines=tuple(lines))
+    _expect(path, columns, axes, axes)
+    _refuse(path, solution)
     scale = [math.pi / 180 if machine.axes[n].rotary else 1e-3 for n in machine.letters]
-    positions = np.stack([columns[name] for name in names], axis=1) * scale
+    positions = np.stack([columns[name] for name in axes], axis=1) * scale
     tip, axis = predict(machine, positions).centre, tool_axis(machine, positions)
-    return _commanded(machine, _feature(path, lines, tip, axis, given, surface), positions)
+    feature = _feature(path, lines, tip, axis, given, surface or LEFT)
+    return _commanded(machine, feature, positions, lines)
+
+
+def _refuse(path: Path, solution: str | None) -> None:
+    if solution is not None:
+        raise UserError(
+            f'{path}: gives the positions of the axes: leave --solution out, it chooses between '
+            'those that point the tool one way'
+        )
 
 
 def _program(path: Path, text: str, machine: Machine, surface: str) -> Commands:
     blocks = read_blocks(path, text, machine)
     limit = np.array([_PIECE_TURN if machine.axes[n].rotary else _PIECE for n in machine.letters])
-    starts, ends = [], []
-    for start, end in zip(blocks.start, blocks.end, strict=True):
+    starts, ends, lines = [], [], []
+    for start, end, line in zip(blocks.start, blocks.end, blocks.line, strict=True):
         pieces = max(1, math.ceil(float((np.abs(end - start) / limit).max())))
         rows = start + np.linspace(0.0, 1.0, pieces + 1)[:, None] * (end - start)
         starts.append(rows[:-1])
         ends.append(rows[1:])
+        lines += [line] * pieces
     start, end = np.concatenate(starts), np.concatenate(ends)
     if len(start) > _MOST:
         raise UserError(
@@ -103,13 +129,16 @@ def _program(path: Path, text: str, machine: Machine, surface: str) -> Commands:
         weight=np.linalg.norm(travel[good], axis=1),
     )
     note = f'{(~good).sum()} of {len(good)} pieces along the tool axis cut no flank: left out'
-    return _commanded(machine, feature, positions[good], () if good.all() else (note,))
+    kept = [line for line, cuts in zip(lines, good, strict=True) if cuts]
+    return _commanded(machine, feature, positions[good], kept, () if good.all() else (note,))
 
 
 def _commanded(
-    machine: Machine, feature: Feature, positions: np.ndarray, notes: tuple[str, ...] = ()
+    machine: Machine, feature: Feature, positions: np.ndarray, lines: Sequence[int],
+    notes: tuple[str, ...] = (),
 ) -> Commands:
-    return Commands(machine, feature, positions, (*notes, *out_of_range(machine, positions)))
+    beyond = out_of_range(machine, positions).values()
+    return Commands(machine, feature, positions, (*notes, *beyond), tuple(lines))
 
 
 def _table(path: Path, text: str) -> tuple[dict[str, np.ndarray], list[int]]:
@@ -138,12 +167,15 @@ def _table(path: Path, text: str) -> tuple[dict[str, np.ndarray], list[int]]:
     return dict(zip(names, np.array(rows).T, strict=True)), lines
 
 
-def _expect(path: Path, columns: dict[str, np.ndarray], names: list[str] | tuple) -> None:
+def _expect(
+    path: Path, columns: dict[str, np.ndarray], names: Sequence[str], axes: Sequence[str]
+) -> None:
+    """Refuse other columns than `names`. axes : columns of positions of the axes."""
     optional = set(_NORMAL) if _NORMAL[0] in columns else set()
     if set(columns) != set(names) | optional:
         raise UserError(
-            f'{path}: columns {", ".join(columns)}; expected {", ".join(names)}, or '
-            f'{", ".join((*_TIP, *_AXIS))}, each with or without {", ".join(_NORMAL)}'
+            f'{path}: columns {", ".join(columns)}; expected {", ".join((*_TIP, *_AXIS))}, or '
+            f'{", ".join(axes)}, each with or without {", ".join(_NORMAL)}'
         )
 
 

@@ -42,7 +42,8 @@ class Ranked:
     """What one error does to the form [m].
 
     alone : form deviation that it makes alone; without : that of all errors but this one, None
-    where there is no sum; standard : by 10 µm or 0.01 deg of it, None for what is no one number
+    where there is no sum; standard : by 10 µm or 0.01 deg of it, None for what is no one number;
+    formula : of an effect that its name does not say
     """
 
     name: str
@@ -51,6 +52,7 @@ class Ranked:
     without: float | None
     standard: float | None
     constant: bool
+    formula: str = ''
 
 
 @dataclass(frozen=True)
@@ -65,6 +67,7 @@ class Prediction:
     varying : under all that is not constant (Fig. 6-9 b), to first order
     motions : form deviation by each error motion that is not constant, the largest first [m]; its
         components may cancel in part
+    unknown : errors that matter here and are not in any of these, uncertainties included
     """
 
     commands: Commands
@@ -79,6 +82,7 @@ class Prediction:
     motions: dict[str, float]
     ranking: tuple[Ranked, ...]
     notes: tuple[str, ...]
+    unknown: tuple[str, ...] = ()
 
 
 def form(commands: Commands, error: np.ndarray, cone: Frustum | None = None) -> Form:
@@ -119,6 +123,7 @@ def predict_form(commands: Commands, errors: Errors, cone: Frustum | None = None
         form(commands, errors.error - errors.constant_error, cone),
         _motions(commands, errors.parts),
         rank(commands, errors.parts, summed=True), (*commands.notes, *errors.notes),
+        errors.unknown,
     )
 
 
@@ -134,6 +139,7 @@ def rank(commands: Commands, parts: Sequence[Part], summed: bool = False) -> tup
             part.name, part.size, float(judge(part.deviation)),
             None if total is None else float(judge(total - part.deviation)),
             None if part.standard is None else float(judge(part.standard)), part.constant,
+            part.formula,
         )
         for part in parts
     ]

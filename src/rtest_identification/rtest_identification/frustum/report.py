@@ -65,7 +65,8 @@ def prediction_report(
     """Write the report of a predicted feature. feed : of the tool on the part [m/s]."""
     pictures = Pictures(out)
     around = '' if cone is None else (
-        ' Grey circle: nominal, dot: where the path starts; outside it material is left.'
+        ' Grey circle: nominal, dot: where the path starts; outside it material is left. The axes '
+        'are mm of the part, deviations are magnified: read them by the bar.'
     )
     pictures.add(
         'contour', figures.contour(found, cone),
@@ -118,7 +119,8 @@ def tables_report(
     pictures.add(
         'tables', figures.tables(lines),
         'Circularity of every row as printed and as computed here; bars are standard deviations '
-        'over the simulations. Table 6-2 has none.',
+        'over the simulated machines: how much these differ, not how uncertain the mean is. '
+        'Table 6-2 has none.',
     )
     for case, made in commands.items():
         slope = response(made)
@@ -155,7 +157,8 @@ def _common(
         )
     pictures.add(
         f'commands{suffix}', figures.commands(commands, feed),
-        'Positions of the axes along the path (Fig. 6-2), rotary axes unwrapped.',
+        'Positions of the axes along the path (Fig. 6-2), rotary axes unwrapped. Times as if the '
+        'feed was kept; where an axis would have to turn very fast, a machine slows down.',
     )
 
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from rtest_estimation.errors import UserError
 from rtest_identification.error_field import ErrorField
 from rtest_identification.frustum.commands import Commands
 from rtest_identification.frustum.contour import contour_error, jacobian, response
@@ -52,6 +53,7 @@ class Part:
     standard : (n,) the same for 10 µm or 0.01 deg of it; None for what is no single number
     constant : whether it is a location error or a squareness
     motion : the error motion that it is a component of; its own name where it is no component
+    formula : what an effect with a name like `coning/C.2` is
     """
 
     name: str
@@ -60,6 +62,7 @@ class Part:
     standard: np.ndarray | None
     constant: bool
     motion: str = ''
+    formula: str = ''
 
 
 @dataclass(frozen=True)
@@ -69,6 +72,7 @@ class Errors:
     error, constant_error : (n, 3) of the tool tip by all of them, and by the location errors and
         squareness alone, frame ``table`` [m], exact
     draws, constant_draws : (trials, n) what they may be wrong by, along the normal [m]
+    unknown : errors that matter here and are not known: neither in the errors nor in the draws
     """
 
     parts: tuple[Part, ...]
@@ -77,6 +81,7 @@ class Errors:
     draws: np.ndarray
     constant_draws: np.ndarray
     notes: tuple[str, ...] = ()
+    unknown: tuple[str, ...] = ()
 
 
 def of_sizes(commands: Commands) -> list[Part]:
@@ -100,7 +105,10 @@ def of_sizes(commands: Commands) -> list[Part]:
             for shape in effect.grid
         ], axis=1)
         worst = columns[:, int(np.argmax(commands.feature.form_deviation(columns.T)))]
-        parts.append(Part(effect.key, _SIZES[effect.parameters[0].unit][1], worst, worst, False))
+        parts.append(Part(
+            effect.key, _SIZES[effect.parameters[0].unit][1], worst, worst, False,
+            formula=effect.formula,
+        ))
     return parts
 
 
@@ -112,17 +120,24 @@ def of_field(
     Raises UserError where the path leaves the measured stations.
     """
     positions, slope = commands.positions, response(commands)
-    field.errors(positions)  # refuses what is outside
+    outside = ~field.errors(positions, outside='nan').inside
+    if outside.any():
+        row = int(np.argmax(outside))
+        try:
+            field.errors(positions[row])
+        except UserError as error:
+            raise UserError(f'{commands.where(row)}: {error}') from None
     columns = [p.column for p in field.parameters]
     # What is not determined is taken for zero, and mentioned where it matters.
     lost = [p.symbol in field.undetermined for p in field.parameters]
     constant = np.zeros(slope.shape)
     constant[:, columns] = np.where(lost, 0.0, field.value)
     every = constant.copy()
-    parts, notes = [], [_LINEAR_AXES]
+    parts = []
+    unknown: dict[str, str] = {}
     for p in field.parameters:
         if p.symbol in field.undetermined:
-            notes += _unknown(commands, p, slope)
+            unknown |= _unknown(commands, p, slope)
         else:
             parts.append(constant_part(p, float(constant[0, p.column]), slope))
     design, more = [slope[:, columns]], []
@@ -136,7 +151,7 @@ def of_field(
             letter = ERROR_LETTERS[column % 6]
             p = parameter(commands.machine, nodes.axis, letter, constant=False)
             if p.symbol in field.undetermined:
-                notes += _unknown(commands, p, slope)
+                unknown |= _unknown(commands, p, slope)
                 continue
             parts.append(Part(
                 p.symbol, f'{_range(values[:, row], p.angular)} on the path',
@@ -163,7 +178,7 @@ def of_field(
     )
     return Errors(
         tuple(parts), error, constant_error, draws, draw(rng, design[0] @ alone, trials),
-        tuple(notes),
+        (_LINEAR_AXES, *unknown.values()), tuple(unknown),
     )
 
 
@@ -176,15 +191,16 @@ def constant_part(p: ErrorParameter, value: float, slope: np.ndarray) -> Part:
     )
 
 
-def _unknown(commands: Commands, p: ErrorParameter, slope: np.ndarray) -> list[str]:
+def _unknown(commands: Commands, p: ErrorParameter, slope: np.ndarray) -> dict[str, str]:
+    """An error that is not determined, in words, where it matters."""
     standard = size(p.angular) * slope[:, p.column]
     form = float(commands.feature.form_deviation(standard))
     if form < _MATTERS:
-        return []
-    return [
+        return {}
+    return {p.symbol: (
         f'{p.symbol} was not determined and is taken for zero: {_SIZES[p.unit][1]} of it alone '
         f'would make {form * 1e6:.2f} µm'
-    ]
+    )}
 
 
 def _motion(axis: Axis, letter: str) -> str:

@@ -12,6 +12,7 @@ from typing import Any
 import yaml
 
 from rtest_estimation.errors import UserError
+from rtest_estimation.yaml_text import read_yaml
 from rtest_identification.gap.catalogue import every_effect
 from rtest_identification.gap.effects import Effect
 from rtest_identification.machine import Machine
@@ -134,12 +135,7 @@ def load_model(path: Path | str) -> Model:
 
     Raises UserError naming file, key and what is expected.
     """
-    try:
-        data = yaml.safe_load(Path(path).read_text(encoding='utf-8'))
-    except (OSError, UnicodeDecodeError) as error:
-        raise UserError(f'{path}: cannot read the model: {error}') from None
-    except yaml.YAMLError as error:
-        raise UserError(f'{path}: not valid YAML: {" ".join(str(error).split())}') from None
+    data = read_yaml(path, 'the model')
     if not isinstance(data, dict):
         raise UserError(f'{path}: expected a mapping with name, machine, values and effects')
     _only(data, _KEYS, str(path))

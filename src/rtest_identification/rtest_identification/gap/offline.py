@@ -45,6 +45,7 @@ def gap_recording(
     effects_path: Path | str | None = None,
     machine_path: Path | str | None = None,
     progress: Callable[[str], None] = lambda line: None,
+    topics: Mapping[str, str] | None = None,
 ) -> SessionGap:
     """Run the workflow on a recording alone.
 
@@ -52,20 +53,21 @@ def gap_recording(
 
     model : what is known of the machine; effects_path : the user's own effects
     machine_path : another machine file than the recorded one
+    topics : role to topic name, as in `rtest_estimation.recording.read_recording`
 
     Raises UserError naming file and what is expected.
     """
     bag = read_bag(path, TYPES)
-    machine = machine_of(bag, machine_path)
+    machine = machine_of(bag, machine_path, topics)
     more, warnings = [], []
     if effects_path is not None:
         more = load_effects(effects_path, machine, temperatures(bag, warnings))
     if model:
         model.check(machine, more)
         model.free(machine)  # Raises where it lists an error that the machine does not have.
-    recording = recording_of(bag)
+    recording = recording_of(bag, topics)
     finished = estimate_recording(recording, None, progress)
-    directions = {f.nest.setup: f.nest.direction for f in finished if f.nest is not None}
+    directions = {f.nest.setup: f.nest.sensitive for f in finished if f.nest is not None}
     progress('comparing model and measurement')
     session = gap_session(machine, [f.cycle for f in finished], directions, model, more)
     known = library(session.result.rows.scene)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rtest_msgs.msg import Cycle, ErrorMap, LocationErrors, ModelGap, NestCalibration
@@ -15,15 +14,17 @@ from rtest_estimation.attempts import counted
 from rtest_estimation.errors import UserError
 from rtest_estimation.nodes import diagnostics
 from rtest_estimation.nodes.qos import LATCHED, LATCHED_100
-from rtest_estimation.nodes.run import run
+from rtest_estimation.nodes.run import run, when_time_goes_back
 from rtest_estimation.records import Cycle as CycleRecord
 from rtest_estimation.records import Kind
+from rtest_estimation.records import NestCalibration as NestRecord
 from rtest_identification.gap.model_file import load_model
 from rtest_identification.gap.offline import gap_session
 from rtest_identification.gap.output import summary
 from rtest_identification.machine import Machine, parse_machine
 from rtest_identification.nodes import publish
 from rtest_identification.nodes.markers import position_markers
+from rtest_identification.observations import turns
 from rtest_identification.pipeline import Identification, identify
 
 
@@ -33,8 +34,8 @@ class IdentifierNode(Node):
     def __init__(self) -> None:
         super().__init__('identifier')
         self._machine: Machine | None = None
-        self._cycles: list[CycleRecord] = []
-        self._result: Identification | None = None
+        self._begin()
+        self._back = when_time_goes_back(self, self._begin)
         self._problem = 'waiting for the machine'
         self._location = self.create_publisher(LocationErrors, 'rtest/location_errors', LATCHED)
         self._map = self.create_publisher(ErrorMap, 'rtest/error_map', LATCHED_100)
@@ -43,19 +44,22 @@ class IdentifierNode(Node):
         self._gap = self.create_publisher(ModelGap, 'rtest/model_gap', LATCHED)
         model = self.declare_parameter('model', '').value
         self._model = load_model(model) if model else None
-        self._directions: dict[str, np.ndarray] = {}
+        self._nests: dict[str, NestRecord] = {}
         self.create_subscription(String, 'rtest/machine', self._on_machine, LATCHED)
         self.create_subscription(NestCalibration, 'rtest/nest', self._on_nest, LATCHED_100)
         self.create_subscription(Cycle, 'rtest/cycle', self._on_cycle, LATCHED_100)
         self.create_service(Trigger, '~/finish', self._on_finish)
         self.create_timer(1.0, self._report, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
+    def _begin(self) -> None:
+        self._cycles: list[CycleRecord] = []
+        self._result: Identification | None = None
+
     def _on_machine(self, message: String) -> None:
         try:
             self._machine = parse_machine(message.data, 'rtest/machine')
             self._problem = 'waiting for a static cycle'
-            if any(c.plan.kind is Kind.STATIC for c in self._cycles):
-                self._identify()
+            self._identify()
         except UserError as error:
             self._machine, self._problem = None, str(error)
             self.get_logger().error(str(error))
@@ -67,21 +71,20 @@ class IdentifierNode(Node):
             self.get_logger().error(f'rtest/cycle: {error}')
             return
         if any(c.plan.session != cycle.plan.session for c in self._cycles):
-            self._cycles.clear()
-            self._result = None
+            self._begin()
         self._cycles = counted([*self._cycles, cycle])
         if cycle.plan.kind is Kind.STATIC:
             self._identify()
 
     def _on_nest(self, message: NestCalibration) -> None:
         nest = messages.nest_calibration(message)
-        self._directions[nest.calibration] = nest.direction
+        self._nests[nest.calibration] = nest
 
     def _identify(self) -> None:
-        if self._machine is None:
+        if self._machine is None or not any(turns(self._machine, c.plan) for c in self._cycles):
             return
         try:
-            result = identify(self._machine, tuple(self._cycles))
+            result = identify(self._machine, tuple(self._cycles), nests=self._used_nests())
         except UserError as error:
             self._problem = str(error)
             self.get_logger().warning(str(error))
@@ -96,6 +99,10 @@ class IdentifierNode(Node):
         self._markers.publish(position_markers(result, stamp))
 
     def _on_finish(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        if self._cycles and not any(c.plan.kind is Kind.STATIC for c in self._cycles):
+            response.success = any(c.plan.kind is Kind.DYNAMIC for c in self._cycles)
+            response.message = 'no static cycle to identify'
+            return response
         self._identify()
         response.success = self._result is not None
         response.message = self._summary()
@@ -103,13 +110,20 @@ class IdentifierNode(Node):
             response.message += f'; {self._find_gap()}'
         return response
 
+    def _used_nests(self) -> list[NestRecord]:
+        """Calibrations of the cycles, in the order in which they were made."""
+        names = dict.fromkeys(cycle.calibration for cycle in self._cycles)
+        return sorted(
+            (self._nests[name] for name in names if name in self._nests), key=lambda n: n.stamp
+        )
+
     def _find_gap(self) -> str:
         """Compare model and measurement, publish what was found, and sum it up."""
         cycles = tuple(self._cycles)
         directions = {
-            cycle.plan.setup: self._directions[cycle.calibration]
+            cycle.plan.setup: self._nests[cycle.calibration].sensitive
             for cycle in cycles
-            if cycle.calibration in self._directions
+            if cycle.calibration in self._nests
         }
         try:
             found = gap_session(self._machine, cycles, directions, self._model)

@@ -2,18 +2,32 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from rtest_estimation.errors import UserError
-from rtest_estimation.records import Cycle, Kind
+from rtest_estimation.records import Cycle, CyclePlan, Kind
 from rtest_identification.thermal.poses import Poses, places
 from rtest_identification.thermal.series import Series, change_between
 
 # Fewer poses in common tell nothing.
 FEWEST_POSES = 6
+
+
+def told_apart(plans: Sequence[CyclePlan]) -> tuple[CyclePlan, ...]:
+    """Plans with a name each: a cycle that is there again is another one, not a second attempt."""
+    count: Counter[str] = Counter(plan.cycle for plan in plans)
+    seen: Counter[str] = Counter()
+    named = []
+    for plan in plans:
+        seen[plan.cycle] += 1
+        if count[plan.cycle] > 1:
+            plan = replace(plan, cycle=f'{plan.cycle} ({seen[plan.cycle]})')
+        named.append(plan)
+    return tuple(named)
 
 
 def repeated(cycles: Sequence[Cycle]) -> tuple[list[Cycle], Cycle, list[str]]:

@@ -48,7 +48,7 @@ def temperatures(result: Thermal) -> Figure:
     for number, one in enumerate(result.thermometers):
         if not len(one):
             continue
-        start = float(one.mean(np.array([origin]), result.clock.window)[0])
+        start = float(one.mean(np.array([origin]), result.clock.duration)[0])
         seconds = (one.stamp - origin) * 1e-9
         colour = SETUP_COLOURS[number % len(SETUP_COLOURS)]
         axes.plot(time(seconds), one.celsius - start, color=colour, alpha=0.25, linewidth=0.6)

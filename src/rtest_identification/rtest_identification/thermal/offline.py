@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
 from rtest_estimation.bagfile import read_bag
 from rtest_estimation.errors import UserError
 from rtest_estimation.recording import TYPES, recording_of, temperatures
-from rtest_estimation.records import CyclePlan
 from rtest_identification.offline import estimate_recording, lost_cycles, machine_of
+from rtest_identification.thermal.cycles import told_apart
 from rtest_identification.thermal.pipeline import Thermal, identify_thermal
 from rtest_identification.thermal.temperature import Thermometer
 from rtest_identification.uncertainty import load_priors
@@ -43,7 +42,7 @@ def thermal_recording(
     if not thermometers:
         warnings.append('no temperatures were recorded: errors are given over time alone')
     recording = recording_of(bag, topics)
-    recording = replace(recording, plans=_told_apart(recording.plans))
+    recording = replace(recording, plans=told_apart(recording.plans))
     finished = estimate_recording(recording, None, progress)
     try:
         result = identify_thermal(machine, [f.cycle for f in finished], thermometers, priors)
@@ -55,16 +54,3 @@ def thermal_recording(
         result, session=result.session or recording.session,
         warnings=(*recording.warnings, *warnings, *problems, *result.warnings),
     )
-
-
-def _told_apart(plans: Sequence[CyclePlan]) -> tuple[CyclePlan, ...]:
-    """Plans with a name each: a cycle that is there again is another one, not a second attempt."""
-    count: Counter[str] = Counter(plan.cycle for plan in plans)
-    seen: Counter[str] = Counter()
-    named = []
-    for plan in plans:
-        seen[plan.cycle] += 1
-        if count[plan.cycle] > 1:
-            plan = replace(plan, cycle=f'{plan.cycle} ({seen[plan.cycle]})')
-        named.append(plan)
-    return tuple(named)

@@ -176,15 +176,11 @@ def _map(found: MapHistory | None) -> dict[str, Any] | None:
 
 
 def _sensors(result: Thermal) -> dict[str, Any]:
-    """Temperature at every cycle [degC], null where the sensor was silent."""
+    """Temperature during every cycle [degC], null where the sensor was silent."""
     found = {}
     for one in result.thermometers:
-        celsius = one.mean(result.stamp, result.clock.window)
-        celsius = np.where(one.covers(result.stamp, result.clock.near), celsius, np.nan)
-        found[one.sensor] = {
-            'celsius': _numbers(celsius),
-            'stddev': _number(one.mean_stddev(result.clock.window)),
-        }
+        celsius, stddev = result.during_cycles(one)
+        found[one.sensor] = {'celsius': _numbers(celsius), 'stddev': _number(stddev)}
     return found
 
 

@@ -121,6 +121,16 @@ class Thermal:
         found = [one for one in self.errors if one.drift.significant]
         return tuple(sorted(found, key=lambda one: -one.drift.size))
 
+    def during_cycles(self, one: Thermometer) -> tuple[np.ndarray, float]:
+        """Mean temperature during each cycle (k,) [degC] and its standard uncertainty [K].
+
+        NaN where the sensor was silent. Over no more than the cycle: a longer mean is less noisy,
+        but too warm where the heat has just begun, by more than its scatter tells.
+        """
+        celsius = one.mean(self.stamp, self.clock.duration)
+        silent = ~one.covers(self.stamp, self.clock.near)
+        return np.where(silent, np.nan, celsius), one.mean_stddev(self.clock.duration)
+
 
 def identify_thermal(
     machine: Machine,

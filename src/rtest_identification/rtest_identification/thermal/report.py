@@ -44,7 +44,7 @@ def write_report(result: Thermal, out: Path) -> Path:
     page = environment.get_template('thermal.html.j2').render(
         result=result, pictures=pictures, words=words, summary=words.summary(result),
         drifts=[_drift_row(one, result) for one in result.errors],
-        sensors=_sensor_rows(result), cycles=_cycle_rows(result),
+        sensors=_sensor_rows(result), warming=_warming_rows(result), cycles=_cycle_rows(result),
         within=[_within_row(one) for one in result.within],
         plotly=get_plotlyjs() if any(p.script for p in pictures.values()) else '',
     )
@@ -73,7 +73,7 @@ def _draw(result: Thermal, out: Path) -> dict[str, Picture]:
             'Change of each error since the reference cycle; bars are U (k = 2), side by side '
             'within a cycle. Filled: drifts beyond U, with the exponential that fits (dashed '
             'where its time constant is not determined). Hollow: no more than noise makes of so '
-            'many errors.')
+            'many errors. A level that all cycles but the reference share is its noise.')
         _add_positions(result, add)
     against = figures.against_temperature(result)
     if against is not None:
@@ -87,7 +87,8 @@ def _draw(result: Thermal, out: Path) -> dict[str, Picture]:
             f'What {axis} does at each of its stations, change since the reference cycle: '
             'constant error and error map together, in the frame of the axis that carries '
             f'{axis}. Lines: cycles; grey: U (k = 2) about zero. Lines that stay parallel shift '
-            f'as a whole; what changes its shape depends on {axis}.')
+            f'as a whole; what changes its shape from cycle to cycle depends on {axis}. A shape '
+            'that all lines share is the noise of the reference cycle.')
     return made
 
 
@@ -148,6 +149,18 @@ def _sensor_rows(result: Thermal) -> list[dict[str, Any]]:
                 'explained': f'{100.0 * d.explained:.1f} %',
                 'best': one.best is not None and d.sensor == one.best.sensor,
             })
+    return rows
+
+
+def _warming_rows(result: Thermal) -> list[dict[str, str]]:
+    rows = []
+    for one in result.thermometers:
+        start = float(result.during_cycles(one)[0][result.place])
+        rows.append({
+            'sensor': one.sensor,
+            'start': '' if np.isnan(start) else f'{start:.2f}',
+            'change': words.warming(result, one),
+        })
     return rows
 
 

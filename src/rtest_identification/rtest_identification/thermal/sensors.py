@@ -28,8 +28,8 @@ _STEPS = 15
 _REACH = 1.0 / 3.0
 # Draws of the noise of a thermometer, and parts of the time it is averaged over.
 _DRAWS, _PARTS = 40, 5
-# A sensor that changed by less than this many of its standard uncertainties did not change.
-_CHANGED = 4.0
+# A sensor whose noise makes as much of all cycles with this probability did not change.
+_CHANGED = 1e-3
 # Independent values below which a correlation says nothing.
 FEWEST_INDEPENDENT = 4.0
 # An error of which a sensor explains less than this part does not follow it at any lag.
@@ -120,8 +120,11 @@ def changed(thermometer: Thermometer, time: np.ndarray, clock: Clock) -> bool:
     stamps = clock.stamps(time)
     at = thermometer.mean(stamps, clock.window)
     at = at[_read(thermometer, stamps, clock)]
-    spread = thermometer.mean_stddev(clock.window)
-    return bool(len(at) > 1 and np.ptp(at) > _CHANGED * max(spread, 1e-9))
+    spread = max(thermometer.mean_stddev(clock.window), 1e-9)
+    if len(at) < 2:
+        return False
+    chi2 = float(((at - at.mean()) ** 2).sum()) / spread**2
+    return bool(stats.chi2.sf(chi2, len(at) - 1) < _CHANGED)
 
 
 def dependence(

@@ -8,17 +8,22 @@ from rtest_estimation.missing import grouped
 from rtest_identification.symbols import ErrorParameter
 from rtest_identification.thermal.pipeline import History, Thermal
 from rtest_identification.thermal.sensors import FEWEST_INDEPENDENT, Dependence
+from rtest_identification.thermal.temperature import Thermometer
 from rtest_identification.thermal.time_constants import TimeConstant
 from rtest_identification.uncertainty import COVERAGE_FACTOR
 
 # A session shorter than this is told in minutes [s].
 HOURS = 7200.0
+# What is shorter is told in seconds [s].
+_FEW = 120.0
 
 
 def minutes(seconds: float) -> str:
-    """For example 15 min; hours where it is many."""
+    """For example 15 min; seconds where it is few, hours where it is many."""
     if not math.isfinite(seconds):
         return '∞'
+    if abs(seconds) < _FEW:
+        return f'{seconds:.0f} s'
     if abs(seconds) < HOURS:
         return f'{seconds / 60.0:.0f} min'
     return f'{seconds / 3600.0:.1f} h'
@@ -67,6 +72,19 @@ def correlation(one: Dependence) -> str:
     if one.independent < FEWEST_INDEPENDENT:
         worth += ': says nothing of a cause'
     return f'{text} ({worth})'
+
+
+def warming(result: Thermal, one: Thermometer) -> str:
+    """Change of a temperature from the reference to the last cycle, +1.40 ± 0.04 K (k = 2).
+
+    '' where the sensor was silent in one of them.
+    """
+    celsius, stddev = result.during_cycles(one)
+    change = float(celsius[-1] - celsius[result.place])
+    if not math.isfinite(change) or result.place == len(celsius) - 1:
+        return ''
+    # Both readings scatter.
+    return f'{change:+.2f} ± {COVERAGE_FACTOR * math.sqrt(2.0) * stddev:.2f} K'
 
 
 def drift(one: History) -> str:

@@ -1,0 +1,1 @@
+"""Dynamic measurements: continuous readings while a rotary axis turns (section 5.7.2)."""
