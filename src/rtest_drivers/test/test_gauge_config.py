@@ -136,7 +136,8 @@ def test_ranges_are_told_in_the_sense_of_the_nest(tmp_path) -> None:
     # One output counts against the nest; a controller without a range is not known.
     path = write(tmp_path, """
 controllers:
-  - {protocol: keyence-lkg, port: /dev/null, channels: [1, 2], sign: [1, -1], range_mm: [-1, 0.5]}
+  - {protocol: keyence-lkg, port: /dev/null, channels: [1, 2], unit: mm,
+     sign: [1, -1], range_mm: [-1, 0.5]}
   - {protocol: heidenhain-nd287, port: /dev/zero, channels: [3], unit: mm}
 """)
     assert range_text(load_nest(path)) == '-1 0.5; -0.5 1; ?'
