@@ -21,6 +21,8 @@ from rtest_identification.session_file import Device, SessionConfig
 SECONDS = 2.0
 # A device that gives less than this part of the readings asked for is too slow for its settings.
 _FEWEST = 0.8
+# And one that leaves more than this part of the questions without a legal answer is disturbed.
+_MOST_UNANSWERED = 0.05
 # Thermometers are slow: asked so often at least.
 _FEWEST_ANSWERS = 3.5
 # How far each axis is moved for the check of its sense [m], [rad].
@@ -37,6 +39,8 @@ def check_session_devices(
     Raises UserError for mistakes in the device files.
     """
     wrong = []
+    if moves and 'cnc' in config.devices:
+        _can_move(config.devices['cnc'])
     for name, device in config.devices.items():
         try_ = {'gauges': _gauges, 'cnc': _cnc, 'thermometers': _thermometers}[name]
         lines, problems = try_(device)
@@ -115,6 +119,11 @@ def _controller_problems(device: str, one: ControllerCheck) -> Iterator[str]:
         yield f'{device}: {one.problem}'
     elif any(channel.status is Status.DEVICE_ERROR for channel in one.channels):
         yield f'{where}: {one.note}'
+    elif one.unanswered > max(_MOST_UNANSWERED * one.wanted_rate * SECONDS, 1.0):
+        yield (
+            f'{where}: {one.unanswered} questions in {SECONDS:g} s without a legal answer '
+            f'({one.note or "none came"}); check cable, baud rate and earth'
+        )
     elif not one.rate > _FEWEST * one.wanted_rate:
         yield (
             f'{where}: {_number(one.rate, 1)} readings a second instead of {one.wanted_rate:g}; '
@@ -127,12 +136,19 @@ def _cnc(device: Device) -> tuple[list[str], list[str]]:
     lines = [
         f'cnc: {device.backend}, {device.file}',
         f'  {"answers":>7} {"rate [1/s]":>12} {"jitter":>8} {"longest":>8} {"stamp":>8}',
-        f'  {"yes" if found.answers else "no":>7} {_number(found.rate, 1):>12} '
+        f'  {"yes" if found.answers else "no":>7} '
+        f'{f"{_number(found.rate, 1)} of {found.wanted_rate:g}":>12} '
         f'{_ms(found.jitter):>8} {_ms(found.gap):>8} {_ms(found.uncertainty):>8}',
     ]
     lines += _positions(found)
     lines += [f'    {key}: {value}' for key, value in (found.told or {}).items() if value]
-    return lines, [f'cnc: {found.problem}'] if found.problem else []
+    problem = found.problem
+    if not problem and not found.rate > _FEWEST * found.wanted_rate:
+        problem = (
+            f'{_number(found.rate, 1)} feedbacks a second instead of {found.wanted_rate:g}; ask '
+            'for fewer in the device file, or look what keeps the controller or the network busy'
+        )
+    return lines, [f'cnc: {problem}'] if problem else []
 
 
 def _positions(found: CncCheck) -> Iterator[str]:
@@ -147,11 +163,6 @@ def _positions(found: CncCheck) -> Iterator[str]:
 
 def _moves(device: Device) -> tuple[list[str], list[str]]:
     """Every axis a little and back: sign, unit and name of its feedback."""
-    if device.backend != 'linuxcnc':
-        raise UserError(
-            f'--moves: only the backend linuxcnc can be moved, not {device.backend}; move each '
-            'axis by hand and watch the topic rtest/cnc/feedback'
-        )
     file = load_linuxcnc(str(device.file))
     asked = [Move(axis.name, _MOVE[axis.name in ROTARY_LETTERS]) for axis in file.axes]
     backend, control = LinuxCnc(str(device.file)), Control(file)
@@ -167,6 +178,17 @@ def _moves(device: Device) -> tuple[list[str], list[str]]:
     return [f'    {one.text}' for one in findings], [
         f'cnc: {device.file}: {one.text}' for one in findings if one.kind != 'right'
     ]
+
+
+def _can_move(device: Device) -> None:
+    """Raise UserError where this program cannot move the machine."""
+    if device.backend != 'linuxcnc':
+        raise UserError(
+            f'--moves: only the backend linuxcnc can be moved, not {device.backend}; move each '
+            'axis by hand and watch the topic rtest/cnc/feedback'
+        )
+    if not load_linuxcnc(str(device.file)).enable_password:
+        raise UserError(f'{device.file}: enable_password: missing, --moves needs it')
 
 
 def _ms(seconds: float) -> str:

@@ -9,6 +9,7 @@ from typing import Any
 from rtest_drivers.backends import CELL, CNC_BACKENDS, GAUGE_BACKENDS, THERMOMETER_BACKENDS, make
 from rtest_drivers.cnc.linuxcnc import load_linuxcnc
 from rtest_drivers.cnc.programs import program_of
+from rtest_drivers.gauges.config import load_nest
 from rtest_estimation.errors import UserError
 from rtest_identification.plans import program_name
 from rtest_identification.session_file import BY_HAND, SessionConfig
@@ -36,7 +37,13 @@ def check_devices(config: SessionConfig, path: Path) -> None:
                 f'{where}: backend: expected one of {sorted(BACKENDS[name])}, got '
                 f'{device.backend!r}'
             )
-        make(BACKENDS[name], device.backend, str(device.file))
+        made = make(BACKENDS[name], device.backend, str(device.file))
+        if name == 'cnc':
+            _check_axes(device.file, made.axes, config.machine.letters)
+        if name == 'gauges' and (count := load_nest(device.file).channels) < 3:
+            raise UserError(
+                f'{device.file}: controllers: {count} gauges, a sphere centre needs three'
+            )
         if device.programs == BY_HAND:
             continue
         if device.backend != 'linuxcnc':
@@ -52,3 +59,15 @@ def check_devices(config: SessionConfig, path: Path) -> None:
                     'session file; '
                     'write them with `rtest plan` and run the session file it wrote'
                 )
+
+
+def _check_axes(file: Path, told: tuple[str, ...], needed: tuple[str, ...]) -> None:
+    """The feedback must have the machine's axes; others are not looked at, but mean a mistake."""
+    for letter in needed:
+        if letter not in told:
+            raise UserError(f'{file}: axes: {letter}: missing, the machine has {" ".join(needed)}')
+    for letter in told:
+        if letter not in needed:
+            raise UserError(
+                f'{file}: axes: {letter}: the machine has no such axis, only {" ".join(needed)}'
+            )

@@ -324,14 +324,15 @@ def test_items_that_are_not_the_position_of_one_axis(
         monkeypatch.setattr(agent, '_probe', probe)
 
 
-def test_a_next_sequence_that_stays_is_refused(
-    backend: MtConnect, agent: MtConnectAgent, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize('next_', [1, 0, 99999999999999999999])
+def test_a_next_sequence_that_cannot_be_is_refused(
+    backend: MtConnect, agent: MtConnectAgent, monkeypatch: pytest.MonkeyPatch, next_: int
 ) -> None:
     follow(backend, 0.05)
     header = agent._header
-    monkeypatch.setattr(agent, '_header', lambda following: header(1))
+    monkeypatch.setattr(agent, '_header', lambda following: header(next_))
     agent.observe({'Xact': 2.0})
-    with pytest.raises(ConnectionError, match='says that 1 is the next after'):
+    with pytest.raises(ConnectionError, match=f'says that the next is {next_}'):
         follow(backend, 1.0)
 
 
@@ -359,6 +360,19 @@ def test_an_answer_that_never_ends_is_given_up(sent: tuple[bytes, bytes]) -> Non
             agent.get('current', 0.3)
         stop.set()
         thread.join()
+
+
+def test_an_agent_that_has_just_started_is_not_without_connection(tmp_path: Path) -> None:
+    agent = MtConnectAgent(ITEMS)
+    backend = MtConnect(device(tmp_path, agent))
+    backend.open()
+    follow(backend, 0.05)
+    assert 'no connection to the controller' in backend.problem()
+    agent.observe({'Xact': 1.0, 'Bact': 90.0})
+    assert follow(backend, 0.1)
+    assert backend.problem() == ''
+    backend.close()
+    agent.close()
 
 
 def test_overwritten_observations_are_a_loss_that_is_told(

@@ -172,3 +172,31 @@ def test_the_examples_are_right() -> None:
     assert load_nest(config.devices['gauges'].file).channels == 3
     text = config_path('linuxcnc_example.yaml').read_text()
     assert set(yaml.safe_load(text)['axes']) == set('XYZBC')
+
+
+@pytest.mark.parametrize(
+    ('old', 'new', 'words'),
+    [
+        ('C: {index: 4, unit: deg}', 'A: {index: 4, unit: deg}', 'axes: C: missing, the machine'),
+        ('C: {', 'A: {index: 5, unit: deg}, C: {', 'axes: A: the machine has no such axis'),
+    ],
+)
+def test_axes_of_the_controller_are_those_of_the_machine(written, old, new, words) -> None:
+    path = written(linuxcnc=LINUXCNC.replace(old, new))
+    with pytest.raises(UserError, match=words):
+        check_devices(load_session(path), path)
+
+
+def test_two_gauges_are_no_nest(written) -> None:
+    path = written()
+    nest = path.parent / 'nest.yaml'
+    nest.write_text(NEST.replace('[1, 2, 3]', '[1, 2]'))
+    with pytest.raises(UserError, match='2 gauges, a sphere centre needs three'):
+        check_devices(load_session(path), path)
+
+
+def test_moves_need_a_password_before_anything_is_tried(written, capsys) -> None:
+    path = written()
+    assert main(['session', '--config', str(path), '--check', '--moves']) == 2
+    said = capsys.readouterr()
+    assert said.out == '' and 'cnc.yaml: enable_password: missing, --moves needs it' in said.err

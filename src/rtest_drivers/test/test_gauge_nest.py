@@ -15,7 +15,7 @@ import pytest
 import serial.rfc2217
 
 from rtest_drivers.gauges import controller
-from rtest_drivers.gauges.check import check_controllers
+from rtest_drivers.gauges.check import check_nest
 from rtest_drivers.gauges.config import load_nest
 from rtest_drivers.gauges.frames import Line
 from rtest_drivers.gauges.nest import SerialNest
@@ -30,7 +30,6 @@ from rtest_drivers.sim.gauge_devices import (
     Mux10,
     Nd287,
 )
-from rtest_estimation.errors import UserError
 from rtest_estimation.records import GaugeBlock, Status
 
 NAMES = {
@@ -341,12 +340,6 @@ def test_a_port_in_use(cell) -> None:
     assert found.health()[0] == ''
 
 
-def test_an_unknown_kind_of_port(cell) -> None:
-    cell.entry('keyence-lkg', 'foo://bar', 1)
-    with pytest.raises(UserError, match=r"port: expected a device, .* got 'foo://bar'"):
-        cell.nest()
-
-
 def test_left_in_the_set_up_mode(cell) -> None:
     device = cell.add(Lkg(lambda: [0.0]), 1)
     device.emulator.measuring = False
@@ -488,7 +481,7 @@ def test_check_of_a_nest(cell) -> None:
     cell.add(Nd287(lambda: [2.5e-4]), 1, ', rate_hz: 20, sign: -1')
     silent = cell.add(Nd287(lambda: [0.0]), 1)
     silent.fault = 'silent'
-    laser, display, dead = check_controllers(load_nest(cell.path).controllers, 1.0)
+    laser, display, dead = check_nest(load_nest(cell.path), 1.0)
     assert (laser.problem, display.problem) == ('', '')
     assert laser.rate == pytest.approx(100.0, rel=0.05)
     assert (laser.wanted_rate, display.unit, laser.limits) == (100.0, 'mm', (-1e-3, 1e-3))

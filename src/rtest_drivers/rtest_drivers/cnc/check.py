@@ -15,6 +15,10 @@ from rtest_estimation.records import Feedback
 class Watched(Protocol):
     """A backend of the CNC driver that tells of itself."""
 
+    @property
+    def rate(self) -> float:
+        """How often it is to give feedback [1/s]."""
+
     def open(self) -> None:
         """Connect."""
 
@@ -40,8 +44,9 @@ class CncCheck:
 
     answers : whether it could be opened and gave feedback
     problem : what is wrong, '' where nothing is
-    rate : feedback per second; jitter : standard deviation, gap : largest, of the time between
-        two stamps [s]; NaN where fewer than three came
+    rate, wanted_rate : feedback a second, and what the device file asks for [1/s]
+    jitter, gap : standard deviation and largest of the time between two stamps [s]; NaN where
+        fewer than three came
     uncertainty : of the stamps [s]
     position : axis to its last value [m] or [rad]
     frozen : whether no digit of any axis has changed: it stands still, or its values are dead
@@ -57,6 +62,7 @@ class CncCheck:
     position: dict[str, float] | None = None
     frozen: bool = False
     told: dict[str, str] | None = None
+    wanted_rate: float = math.nan
 
 
 def check(backend: Watched, seconds: float = 2.0) -> CncCheck:
@@ -74,7 +80,9 @@ def check(backend: Watched, seconds: float = 2.0) -> CncCheck:
         backend.close()
     problem, uncertainty, told = found
     if not feedback:
-        return CncCheck(False, problem or f'no feedback in {seconds:g} s', told=told)
+        return CncCheck(
+            False, problem or f'no feedback in {seconds:g} s', told=told, wanted_rate=backend.rate
+        )
     steps = np.diff([one.stamp for one in feedback]) * 1e-9
     known = len(steps) > 1
     last = feedback[-1]
@@ -88,4 +96,5 @@ def check(backend: Watched, seconds: float = 2.0) -> CncCheck:
         dict(zip(last.axes, map(float, last.position), strict=True)),
         known and all(np.array_equal(one.position, last.position) for one in feedback),
         told,
+        backend.rate,
     )

@@ -112,6 +112,16 @@ class LinuxCnc:
         self._state: State | None = None
         self._round_trip = Recent()
 
+    @property
+    def axes(self) -> tuple[str, ...]:
+        """Letters of the axes in the device file."""
+        return names(self._file.axes)
+
+    @property
+    def rate(self) -> float:
+        """What the device file asks for [1/s]."""
+        return self._file.rate
+
     def open(self) -> None:
         """Connect; raises ConnectionError saying what failed and what to do."""
         self.close()

@@ -28,7 +28,7 @@ from dataclasses import dataclass
 from urllib.parse import quote
 
 from rtest_drivers.clock import HostClock
-from rtest_drivers.cnc.axes import AxisSource
+from rtest_drivers.cnc.axes import AxisSource, names
 from rtest_drivers.cnc.clock import DeviceClock, Recent
 from rtest_drivers.cnc.device_file import load
 from rtest_drivers.cnc.join import Joiner, Sample
@@ -97,6 +97,16 @@ class MtConnect:
         self._host = HostClock()
         self._agent: Agent | None = None
 
+    @property
+    def axes(self) -> tuple[str, ...]:
+        """Letters of the axes in the device file."""
+        return names(self._file.axes)
+
+    @property
+    def rate(self) -> float:
+        """What the device file asks for [1/s]."""
+        return 1.0 / self._file.period
+
     def open(self) -> None:
         """Connect; raises ConnectionError saying what failed and what to do."""
         self.close()
@@ -106,6 +116,7 @@ class MtConnect:
         self._under_way, self._round_trip = Recent(), Recent()
         # Id of a data item to what was last said of it.
         self._states: dict[str, str] = {}
+        self._was_available = False
         self._lost = 0
         self._lost_at = -math.inf
         agent = Agent(file.url)
@@ -146,7 +157,9 @@ class MtConnect:
             return ''
         if not self._states:
             return ''  # Not asked yet.
-        if UNAVAILABLE in self._said(_AVAILABILITY):
+        # An agent that has only just started does not know it, with or without a connection.
+        gone = UNAVAILABLE in self._said(_AVAILABILITY)
+        if gone and (self._was_available or self._joiner.unknown):
             return 'the agent has no connection to the controller; look at its adapter'
         if self._estop() == 'on':
             return 'E-stop is on; release it and run the cycle again'
@@ -222,10 +235,7 @@ class MtConnect:
         if header.first > self._from:
             self._lose(header.first - self._from)
         if header.next < self._from or header.next == self._from <= header.last:
-            raise DocumentError(
-                f'the MTConnect agent at {self._file.url} has observations up to {header.last} '
-                f'but says that {header.next} is the next after {self._from}; start it again'
-            )
+            raise self._nonsense(header)
         self._from = header.next
         samples = self._samples(observations, arrival, True)
         if header.next <= header.last:
@@ -239,6 +249,7 @@ class MtConnect:
         """The positions among them; `stamped` where their stamps say when they were so."""
         for one in observations:
             self._states[one.item] = one.text[:40]
+        self._was_available |= 'AVAILABLE' in self._said(_AVAILABILITY)
         letters = self._joiner.names
         wanted = [one for one in observations if self._names.get(one.item) in letters]
         stamps = [arrival] * len(wanted)
@@ -322,6 +333,15 @@ class MtConnect:
                 f'the MTConnect agent at {self._file.url} was started again; what it saw '
                 'meanwhile is lost'
             )
+        if not 0 < header.next <= header.last + 1:
+            raise self._nonsense(header)
+
+    def _nonsense(self, header: Header) -> DocumentError:
+        return DocumentError(
+            f'the MTConnect agent at {self._file.url} has observations {header.first} to '
+            f'{header.last} but says that the next is {header.next}, asked from '
+            f'{self._from or "the start"}; start it again'
+        )
 
     def _lose(self, count: int) -> None:
         self._lost += max(count, 1)

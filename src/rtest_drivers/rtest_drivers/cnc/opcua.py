@@ -33,7 +33,7 @@ from typing import Any
 
 from rtest_drivers.addresses import split_url
 from rtest_drivers.clock import HostClock
-from rtest_drivers.cnc.axes import AxisSource
+from rtest_drivers.cnc.axes import AxisSource, names
 from rtest_drivers.cnc.clock import DeviceClock, Recent
 from rtest_drivers.cnc.device_file import DeviceReader, load
 from rtest_drivers.cnc.join import Joiner, Sample
@@ -160,6 +160,16 @@ class OpcUa:
         self._axes = {axis.name: axis for axis in self._file.axes}
         self._host = HostClock()
         self._link: Link | None = None
+
+    @property
+    def axes(self) -> tuple[str, ...]:
+        """Letters of the axes in the device file."""
+        return names(self._file.axes)
+
+    @property
+    def rate(self) -> float:
+        """What the device file asks for [1/s]."""
+        return 1.0 / self._file.link.period
 
     def open(self) -> None:
         """Connect; raises ConnectionError saying what failed and what to do."""

@@ -193,9 +193,9 @@ class OpcUaServer:
         node = self._server.get_node(ua.NodeId(ua.ObjectIds.Server_ServerStatus_State))
         self._run(node.write_value(ua.DataValue(ua.Variant(value, ua.VariantType.Int32))))
 
-    def freeze(self, seconds: float) -> None:
-        """Do nothing for some time, with every connection open; returns at once."""
-        self._loop.call_soon_threadsafe(time.sleep, seconds)
+    def freeze(self, until: threading.Event) -> None:
+        """Do nothing until then, with every connection open; returns at once."""
+        self._loop.call_soon_threadsafe(until.wait)
 
     def close(self) -> None:
         """End."""
