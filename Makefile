@@ -4,7 +4,7 @@ PYTHON ?= python3
 
 BIN := .venv/bin
 
-.PHONY: setup demo test lint clean linuxcnc
+.PHONY: setup demo test lint clean linuxcnc chromium
 
 setup:
 	@$(PYTHON) tools/setup_venv.py
@@ -18,13 +18,17 @@ lint: setup
 
 # The graphs of the tests must not join that of a machine in the same network.
 test: export ROS_AUTOMATIC_DISCOVERY_RANGE ?= LOCALHOST
-test: setup lint linuxcnc
+test: setup lint linuxcnc chromium
 	$(BIN)/python -m pytest -m "not graph" -n 2 --dist loadfile
 	$(BIN)/python -m pytest -m graph
 
 # For the tests on a real controller, which are skipped without it.
 linuxcnc:
 	@tools/install_linuxcnc.sh
+
+# For the tests of the page in a browser, which are skipped without it.
+chromium:
+	@tools/install_chromium.sh
 
 clean:
 	rm -rf .venv .pytest_cache .ruff_cache .import_linter_cache build install log

@@ -32,6 +32,7 @@ setup(
             'replay = rtest_drivers.nodes.replay:main',
             'session = rtest_drivers.nodes.session:main',
             'cell = rtest_drivers.nodes.cell:main',
+            'view = rtest_drivers.nodes.view:main',
         ],
     },
 )

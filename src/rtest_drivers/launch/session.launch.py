@@ -8,8 +8,16 @@ from launch_ros.actions import LifecycleNode, Node
 
 from launch import LaunchContext, LaunchDescription
 from rtest_drivers.config import config_path
-from rtest_drivers.graph import ONE_THREAD, GraphSettings, session_name, session_nodes
-from rtest_identification.session_file import load_session
+from rtest_drivers.graph import (
+    ONE_THREAD,
+    VIEW_HOST,
+    VIEW_PORT,
+    GraphSettings,
+    session_name,
+    session_nodes,
+)
+from rtest_identification.session_file import SessionConfig, load_session
+from rtest_identification.urdf import describe
 
 ARGUMENTS = {
     'config': (str(config_path('demo.yaml')), 'session file: machine, cycle, set-ups (YAML)'),
@@ -18,6 +26,9 @@ ARGUMENTS = {
     'simulate': ('', 'truth file of a simulated cell; empty: the devices of the session file'),
     'rate': ('1.0', 'simulated seconds per second'),
     'namespace': ('', 'of every node and topic'),
+    'hold': ('false', 'whether every cycle waits for the service session/start'),
+    'view': ('false', 'whether a page shows the session at http://127.0.0.1:8090/'),
+    'frames': ('false', 'whether robot_state_publisher turns the feedback into tf'),
 }
 
 
@@ -32,8 +43,11 @@ def graph(context: LaunchContext) -> list[Node]:
         simulate=Path(chosen['simulate']).absolute() if chosen['simulate'] else None,
         rate=float(chosen['rate']),
         namespace=chosen['namespace'],
+        hold=chosen['hold'] == 'true',
+        view=(VIEW_HOST, VIEW_PORT) if chosen['view'] == 'true' else None,
     )
-    settings = settings.of(load_session(config))
+    session = load_session(config)
+    settings = settings.of(session)
     return [
         (LifecycleNode if node.lifecycle else Node)(
             package=node.package,
@@ -42,10 +56,24 @@ def graph(context: LaunchContext) -> list[Node]:
             namespace=settings.namespace,
             parameters=[node.parameters],
             output='screen',
-            on_exit=Shutdown(),
+            on_exit=None if node.optional else Shutdown(),
         )
         for node in session_nodes(settings)
-    ]
+    ] + ([_frames(session, settings)] if chosen['frames'] == 'true' else [])
+
+
+def _frames(session: SessionConfig, settings: GraphSettings) -> Node:
+    """The machine's joints have the names of the axes in the feedback."""
+    return Node(
+        package='robot_state_publisher',
+        executable='robot_state_publisher',
+        namespace=settings.namespace,
+        parameters=[{
+            'robot_description': describe(session),
+            'use_sim_time': settings.simulate is not None,
+        }],
+        remappings=[('joint_states', 'rtest/cnc/feedback')],
+    )
 
 
 def generate_launch_description() -> LaunchDescription:

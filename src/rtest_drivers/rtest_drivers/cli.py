@@ -11,6 +11,7 @@ from typing import NoReturn
 
 from rtest_drivers.commands import (
     ask,
+    check,
     correct,
     demo,
     dynamic,
@@ -23,14 +24,16 @@ from rtest_drivers.commands import (
     replay,
     session,
     thermal,
+    topics,
+    view,
 )
 from rtest_drivers.graph import ONE_THREAD
 from rtest_drivers.runner import NodeFailed, Stopped
 from rtest_estimation.errors import UserError
 
 COMMANDS = (
-    session, ask, demo, plan, identify, gap, thermal, dynamic, frustum, correct, laser, replay,
-    info,
+    session, check, view, ask, topics, demo, plan, identify, gap, thermal, dynamic, frustum,
+    correct, laser, replay, info,
 )
 EXIT_FAILED, EXIT_USER, EXIT_INTERRUPTED, EXIT_PIPE = 1, 2, 130, 141
 

@@ -27,6 +27,8 @@ LOGS = 'log'
 INCOMPLETE = 3
 # Simulated seconds per second at which nodes on two processor cores lose nothing.
 RATE = 10.0
+# Where the page is served: on this computer only.
+VIEW_HOST, VIEW_PORT = '127.0.0.1', 8090
 # The problems are small: more threads than one are slower, and not bit for bit repeatable.
 ONE_THREAD = {'OMP_NUM_THREADS': '1', 'OPENBLAS_NUM_THREADS': '1'}
 
@@ -40,12 +42,14 @@ class GraphNode:
     """One node of the graph; its executable has the name of the node.
 
     lifecycle : whether the session node configures and activates it
+    optional : whether the session goes on when it ends
     """
 
     name: str
     package: str
     parameters: dict[str, ParameterValue] = field(default_factory=dict)
     lifecycle: bool = False
+    optional: bool = False
 
     @property
     def module(self) -> str:
@@ -68,6 +72,8 @@ class GraphSettings:
     namespace : of every node and topic, empty for none
     remaps : rules ``from:=to`` for every node
     address : where the simulated cell is to be reached by its drivers (AF_UNIX)
+    hold : whether every cycle waits until it is asked for
+    view : address and port of the page that shows the session; None for no page
     """
 
     config: Path
@@ -82,6 +88,8 @@ class GraphSettings:
     namespace: str = ''
     remaps: tuple[str, ...] = ()
     address: str = field(default_factory=lambda: cell_address())
+    hold: bool = False
+    view: tuple[str, int] | None = None
 
     def __post_init__(self) -> None:
         """Refuse names that would become a wrong path or a wrong ROS argument (UserError)."""
@@ -201,11 +209,21 @@ def session_nodes(settings: GraphSettings) -> tuple[GraphNode, ...]:
                 'config': str(settings.config),
                 'session': settings.session,
                 'simulated': simulated,
+                'hold': settings.hold,
                 **clock,
             },
         )
     )
+    if settings.view is not None:
+        nodes.append(view_node(*settings.view))
     return tuple(nodes)
+
+
+def view_node(host: str, port: int) -> GraphNode:
+    """The node that serves the page. Raises UserError for what is no port."""
+    if not 0 <= port <= 65535:
+        raise UserError(f'--port {port}: expected a number from 0 to 65535')
+    return GraphNode('view', 'rtest_drivers', {'host': host, 'port': port}, optional=True)
 
 
 def _identifier(settings: GraphSettings, clock: dict[str, ParameterValue]) -> GraphNode:

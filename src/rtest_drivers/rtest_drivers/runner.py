@@ -56,12 +56,14 @@ class Command:
 
     log : where its output goes
     shown : its standard output goes to the user instead (standard error still to the log)
+    optional : whether the others go on when it ends
     """
 
     name: str
     arguments: tuple[str, ...]
     log: Path
     shown: bool = False
+    optional: bool = False
 
 
 def run_session(settings: GraphSettings, domain: int) -> bool:
@@ -80,7 +82,8 @@ def run_session(settings: GraphSettings, domain: int) -> bool:
                 *ros_arguments(node, settings.namespace, settings.remaps),
             ),
             settings.log / f'{node.name}.log',
-            shown=node.name == LEADER,
+            shown=node.name == LEADER or node.optional,
+            optional=node.optional,
         )
         for node in session_nodes(settings)
     ]
@@ -123,7 +126,8 @@ def run(
                 child = children[command.name] = _start(command, environment)
                 guard.write(f'{child.pid} {int(command.name == last)}\n')
                 guard.flush()
-            failed = _watch(children, leader, received)
+            needed = {c.name: children[c.name] for c in commands if not c.optional}
+            failed = _watch(needed, leader, received)
             # What failed by itself is known; what ends from here on was told to.
             codes = {name: child.poll() for name, child in children.items()}
         finally:

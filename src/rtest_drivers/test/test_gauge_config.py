@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from rtest_drivers.gauges.config import PROTOCOLS, load_nest
+from rtest_drivers.gauges.config import PROTOCOLS, load_nest, range_text
 from rtest_drivers.gauges.frames import Line
 from rtest_estimation.errors import UserError
 
@@ -130,3 +130,14 @@ def test_more_channels_than_a_message_carries(tmp_path) -> None:
     ]
     with pytest.raises(UserError, match='expected at most 16 channels'):
         load_nest(write(tmp_path, f'controllers: [{", ".join(entries)}]'))
+
+
+def test_ranges_are_told_in_the_sense_of_the_nest(tmp_path) -> None:
+    # One output counts against the nest; a controller without a range is not known.
+    path = write(tmp_path, """
+controllers:
+  - {protocol: keyence-lkg, port: /dev/null, channels: [1, 2], unit: mm,
+     sign: [1, -1], range_mm: [-1, 0.5]}
+  - {protocol: heidenhain-nd287, port: /dev/zero, channels: [3], unit: mm}
+""")
+    assert range_text(load_nest(path)) == '-1 0.5; -0.5 1; ?'

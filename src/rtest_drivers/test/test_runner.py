@@ -10,6 +10,7 @@ import socket
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -98,6 +99,16 @@ def test_a_node_that_dies_stops_all_and_is_named_with_its_last_words(tmp_path):
         ])
     for name in ('recorder', 'session'):
         assert not lives(pid_in(tmp_path / f'{name}.log'))
+
+
+def test_a_session_goes_on_without_a_page(tmp_path):
+    dying = command(tmp_path, 'view', "import sys; sys.exit('the port is taken')")
+    leader = 'import time; time.sleep(1.0)'
+    assert run([
+        command(tmp_path, 'recorder', NODE),
+        replace(dying, optional=True),
+        command(tmp_path, 'session', leader),
+    ])
 
 
 def test_a_node_that_is_killed_is_named_with_the_signal(tmp_path):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from dataclasses import replace
+from itertools import cycle, islice
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,8 @@ from rtest_identification.kinematics import linear_positions
 from rtest_identification.machine import Machine
 
 SPINDLE = 'S'
+# To the first pose of a check.
+VISITS = 10
 # Twelve uneven stations of a full turn. Even ones show harmonic n and 12 - n as one and the same;
 # of these the sum of exp(i n C) is at most 0.33 of the number of stations for every n up to 22, so
 # that no harmonic up to 11 looks like another (cosine at most 0.83 beside location errors), and
@@ -189,6 +192,29 @@ def diagnostic(
     poses = [zero, below, *upward, zero, above, *downward, zero]
     commands = linear_positions(machine, sphere, _rotary(machine, poses))
     return _plan(machine, Kind.STATIC, setup, 'diagnostic', sphere, commands, dwell)
+
+
+def check(
+    machine: Machine,
+    setup: str,
+    sphere: np.ndarray,
+    outer: np.ndarray,
+    inner: np.ndarray,
+    dwell: float = 0.3,
+) -> CyclePlan:
+    """Ten visits to the first pose, from nine others in between, for `rtest check`.
+
+    outer, inner : stations as in `static`, from which the others are taken in turn
+    """
+    zero = (0.0, 0.0)
+    others = [
+        (float(outer[n % len(outer)]), float(inner[n % len(inner)]))
+        for n in range(len(outer) * len(inner))
+    ]
+    away = islice(cycle([one for one in others if one != zero]), VISITS - 1)
+    poses = [zero, *(pose for one in away for pose in (one, zero))]
+    commands = linear_positions(machine, sphere, _rotary(machine, poses))
+    return _plan(machine, Kind.STATIC, setup, 'check', sphere, commands, dwell)
 
 
 def dynamic(

@@ -19,6 +19,7 @@ from rtest_identification.moves import Approach, Speeds
 from rtest_identification.plan_check import Spindle, Table
 from rtest_identification.plans import (
     UNEVEN_DEG,
+    check,
     check_ranges,
     diagnostic,
     dynamic,
@@ -31,6 +32,7 @@ from rtest_identification.session_nest import DWELL_S, calibration_plan, laser_c
 from rtest_identification.session_reader import Reader
 
 STATIC, DIAGNOSTIC, THERMAL, DYNAMIC = 'static', 'diagnostic', 'thermal', 'dynamic'
+CHECK = 'check'
 # Fewer do not tell offset, sine and cosine of an error over the axis from each other.
 FEWEST_STATIONS = 3
 # Closer ones are one pose for the machine and for who looks for its stops.
@@ -41,7 +43,7 @@ _RUNOUT_STATIONS = (6, 360)
 # Less of a turn than this shows no harmonics; nobody waits for more.
 _TURNS = (0.25, 100.0)
 _NAME = re.compile(r'[A-Za-z0-9][A-Za-z0-9._-]*')
-_BUILD = {STATIC: static, DIAGNOSTIC: diagnostic, THERMAL: static}
+_BUILD = {STATIC: static, DIAGNOSTIC: diagnostic, THERMAL: static, CHECK: check}
 # Of a thermal session: between the starts of its cycles, and from the first to the last of them.
 _EVERY_MIN, _HOURS = (0.1, 24.0 * 60.0), (0.01, 24.0 * 14.0)
 _MOST_CYCLES = 2000
@@ -77,8 +79,8 @@ class SessionConfig:
     sphere_radius : [m]
     nest : of contact gauges or of lasers
     plans : in order, each with stamp 0 and an empty session name until it is started
-    kind : of the cycle, 'static', 'diagnostic' or 'thermal'; 'dynamic' where there are dynamic
-        ones only
+    kind : of the cycle, 'static', 'diagnostic', 'thermal' or 'check'; 'dynamic' where there are
+        dynamic ones only
     stations : of each rotary axis [rad], outer one first; none where there is no static cycle
     speeds, approach : how the axes move between poses, and to the first pose
     table, spindle : bodies that must not touch; None where the file says nothing of them

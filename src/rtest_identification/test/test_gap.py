@@ -171,6 +171,18 @@ def test_mistakes_in_a_model_are_told_in_one_line(tmp_path):
         gap_session(MACHINE, cycles, {}, wrong)
 
 
+@pytest.mark.parametrize('poses', [3, 5, 6, 7, 8, 10])
+def test_a_cycle_that_was_ended_after_a_few_poses_is_refused_or_compared(poses):
+    nest, cycle = measured(lambda b, c, p: constant(b, c), np.random.default_rng(1), ('1a',))
+    begun = replace(cycle, points=cycle.points[:poses])
+    try:
+        found = gap_session(MACHINE, [nest, begun], {}).result
+    except UserError as error:
+        assert 'poses' in str(error)
+    else:
+        assert found.verdict in ('no gap', 'unknown effect')
+
+
 def test_the_json_has_the_promised_shape():
     data = as_dict('made', run(EFFECTS['scale/X'], 36), 'model.yaml')
     json.dumps(data, allow_nan=False)

@@ -16,9 +16,17 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from rtest_drivers.commands.view import check_address
 from rtest_drivers.config import config_path
 from rtest_drivers.domain import held_domain
-from rtest_drivers.graph import RATE, GraphSettings, session_name
+from rtest_drivers.graph import (
+    RATE,
+    VIEW_HOST,
+    VIEW_PORT,
+    GraphSettings,
+    session_name,
+    view_node,
+)
 from rtest_drivers.runner import NodeFailed, Stopped, run_session
 from rtest_estimation.errors import UserError
 
@@ -42,6 +50,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--moves', action='store_true',
                         help='with --check: MOVES each axis of a LinuxCNC by 1 mm or 1 deg and '
                         'back, and says which sign, unit or name is wrong')
+    parser.add_argument('--hold', action='store_true',
+                        help='every cycle waits for `rtest ask start`, or for the page')
+    parser.add_argument('--view', action='store_true',
+                        help='show the session on a page, at --host and --port')
+    parser.add_argument('--host', default=VIEW_HOST, metavar='ADDRESS',
+                        help='of the page (default: 127.0.0.1, this computer only)')
+    parser.add_argument('--port', type=int, default=VIEW_PORT, metavar='N',
+                        help=f'of the page (default: {VIEW_PORT})')
     parser.add_argument('--remap', action='append', default=[], metavar='FROM:=TO',
                         help='remap a topic or service in all nodes; may be given several times')
     parser.add_argument('--namespace', default='', metavar='NS',
@@ -76,7 +92,12 @@ def run(arguments: argparse.Namespace) -> int:
         rate=arguments.rate,
         namespace=arguments.namespace,
         remaps=tuple(arguments.remap),
+        hold=arguments.hold,
+        view=(arguments.host, arguments.port) if arguments.view else None,
     )
+    if settings.view is not None:
+        view_node(*settings.view)
+        check_address(*settings.view)
     settings, complete = measure(settings, arguments.domain, bool(arguments.session))
     evaluate(settings, complete)
     return 0

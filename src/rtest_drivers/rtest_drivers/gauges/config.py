@@ -94,6 +94,17 @@ class NestConfig:
         return sum(len(controller.channels) for controller in self.controllers)
 
 
+def range_text(config: NestConfig) -> str:
+    """Ranges of the gauges as diagnostics tell them [mm]: '-1 1; -3 3; ?', in the nest's sense."""
+    texts = ['?'] * config.channels
+    for one in config.controllers:
+        for channel, sign in zip(one.channels, one.signs, strict=True):
+            if one.limits is not None:
+                low, high = sorted(sign * limit * 1e3 for limit in one.limits)
+                texts[channel] = f'{low:g} {high:g}'
+    return '; '.join(texts)
+
+
 def load_nest(path: Path | str) -> NestConfig:
     """Read a device file; raises UserError naming file, key and what is expected."""
     controllers = tuple(_controller(reader) for reader in controller_entries(path))

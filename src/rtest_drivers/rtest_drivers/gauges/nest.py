@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from rtest_drivers.gauges.align import Aligner, Sample
-from rtest_drivers.gauges.config import load_nest
+from rtest_drivers.gauges.config import load_nest, range_text
 from rtest_drivers.gauges.lines import SerialLines
 from rtest_estimation.records import GaugeBlock
 
@@ -76,6 +76,7 @@ class SerialNest(SerialLines):
             mean, largest = self._aligner.skew()
         return warning, {
             **values,
+            'gauge_range_mm': range_text(self.config),
             'skew_mean_ms': f'{mean * 1e3:.2f}',
             'skew_max_ms': f'{largest * 1e3:.2f}',
         }

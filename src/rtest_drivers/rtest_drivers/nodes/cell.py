@@ -52,6 +52,9 @@ class CellNode(Node):
             raise UserError(f'parameter rate: expected 0 or more, got {self._rate}')
         self._cell = Cell(load_truth(truth), epoch or time.time_ns())
         self._server = CellServer(address)
+        gauges = self._cell.truth.gauges
+        one = f'{gauges.lower * 1e3:g} {gauges.upper * 1e3:g}'
+        self._ranges = '; '.join([one] * len(gauges.tilt))
         self._address, self._refused = address, ''
         self._known: set[tuple[str, str, int]] = set()
         # Cycles that faults wait for, and what is to be told once.
@@ -141,6 +144,7 @@ class CellNode(Node):
             'waited_for_drivers': f'{100.0 * held / ticks:.0f} %',
             'connected': ', '.join(self._server.connected) or 'nobody',
             'plans_waiting': cell.waiting,
+            'gauge_range_mm': self._ranges,
         }
         if self._unplanned:
             values['faults_wait_for'] = ', '.join(sorted(self._unplanned))

@@ -55,6 +55,7 @@ CONTRACT: dict[str, tuple[type, QoSProfile]] = {
     'rtest/error_map': (ErrorMap, LATCHED_100),
     'rtest/model_gap': (ModelGap, LATCHED_100),
     'rtest/markers': (MarkerArray, LATCHED_100),
+    'rtest/mark': (String, LATCHED_100),
     '/diagnostics': (DiagnosticArray, STREAM),
 }
 # Messages of one topic taken in a row.

@@ -8,6 +8,7 @@ other messages by the middleware's word, and what the disk refused.
 from __future__ import annotations
 
 import re
+import shutil
 import signal
 import sys
 import time
@@ -133,6 +134,7 @@ class Recorder(Node):
             'bytes': self.writer.size,
             'waiting_bytes': self.writer.waiting,
             'lost': self.lost,
+            'disk_free': shutil.disk_usage(self.writer.path.parent).free,
         }
         for name, check in self._topics.checks.items():
             values[f'lost readings {name}'] = check.lost

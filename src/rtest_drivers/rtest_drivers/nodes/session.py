@@ -3,7 +3,9 @@
 On a real machine somebody starts the NC program of each cycle, or the node does where the session
 file says `run_programs`. A cycle whose program ends before its last pose, as after an E-stop, is
 measured anew. The services `session/repeat` and `session/skip` (std_srvs/Trigger) measure it anew
-at any time, or go on with the next one.
+at any time, or go on with the next one. `session/calibrate` measures the nest of the set-up anew
+and then the cycle; `session/abort` ends the session with what there is. None of them stops the
+machine.
 
 The cycles of a thermal session begin at their times; one whose predecessor takes longer begins
 after it and is told to be late.
@@ -15,6 +17,7 @@ session : name of the session
 simulated : whether the time comes from a simulated cell
 ready_timeout : how long the other nodes may take to appear [s]
 cycle_timeout : how long a cycle may take [s]; 0 is an estimate from its path
+hold : whether every cycle waits for the service `session/start`
 """
 
 from __future__ import annotations
@@ -23,6 +26,7 @@ import math
 import re
 import sys
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
@@ -59,6 +63,7 @@ from rtest_identification.session_file import (
     SessionConfig,
     load_session,
 )
+from rtest_identification.urdf import describe
 
 DRIVERS = ('gauges', 'cnc')
 THERMOMETERS = 'thermometers'
@@ -83,6 +88,15 @@ ENDED_S = 5.0
 # The CNC driver tells its state as often, twice over [s].
 HEARD_S = 1.0
 REPEAT, SKIP = 'repeat', 'skip'
+START, CALIBRATE, ABORT = 'start', 'calibrate', 'abort'
+# What then happens to the cycle.
+GRANTED = {
+    START: 'starts',
+    REPEAT: 'is measured anew',
+    SKIP: 'is left',
+    CALIBRATE: 'is measured anew after a calibration of the nest',
+    ABORT: 'ends, and the session with it',
+}
 # What the CNC driver says where no NC program runs.
 IDLE = 'IDLE'
 
@@ -109,6 +123,7 @@ class SessionNode(Node):
         self.simulated = self.declare_parameter('simulated', False, fixed).value
         self.ready_timeout = self.declare_parameter('ready_timeout', 30.0, fixed).value
         self.cycle_timeout = self.declare_parameter('cycle_timeout', 0.0, fixed).value
+        self.hold = self.declare_parameter('hold', False, fixed).value
         config = self.declare_parameter('config', '', fixed).value
         self.config: SessionConfig = load_session(config)
         self._file, self._folder = Path(config), Path(config).parent
@@ -121,6 +136,7 @@ class SessionNode(Node):
         self._host = HostClock()
 
         self._machine = self.create_publisher(String, 'rtest/machine', LATCHED)
+        self._description = self.create_publisher(String, 'robot_description', LATCHED)
         self._provenance = self.create_publisher(String, TOPIC, LATCHED)
         self._plans = self.create_publisher(CyclePlanMessage, 'rtest/plan', LATCHED_100)
         self._diagnostics = diagnostics.Diagnostics(self)
@@ -137,7 +153,7 @@ class SessionNode(Node):
         self._finish = {
             name: self.create_client(Trigger, f'{name}/finish') for name in self._finishers
         }
-        for wish in (REPEAT, SKIP):
+        for wish in GRANTED:
             self.create_service(Trigger, f'~/{wish}', partial(self._on_wish, wish))
 
         self._spinner = SingleThreadedExecutor()
@@ -153,7 +169,7 @@ class SessionNode(Node):
         self._problems: list[str] = []
         self._status = 'waiting for the other nodes'
         self._cycle_number = 0
-        self._wish, self._following = '', False
+        self._wish, self._held, self._following = '', '', False
         # What each driver last said, and the state of the NC program: since when it has not run.
         self._said: dict[str, str] = {}
         self._heard = 0
@@ -172,6 +188,7 @@ class SessionNode(Node):
             # The drivers are opened next, and need it.
             self._wait_for('/clock of the simulated cell', lambda: self._now() > 0)
         self._machine.publish(String(data=self.config.machine.text))
+        self._description.publish(String(data=describe(self.config)))
         self._provenance.publish(String(data=self._made_by()))
         for name in self._drivers:
             self._bring_to(name, State.PRIMARY_STATE_INACTIVE)
@@ -183,11 +200,22 @@ class SessionNode(Node):
         started = {}
         # Of the repeated cycles: when each is to begin.
         turns = self._turns()
-        for number, plan in enumerate(self.config.plans, 1):
-            self._cycle_number = number
-            due = next(turns) if self.config.every and plan.kind is Kind.STATIC else 0
-            measure = self._measure if self.simulated else self._measure_on_machine
-            started[plan.cycle] = measure(plan, due)
+        left = deque(enumerate(self.config.plans, 1))
+        while left and self._wish != ABORT:
+            self._cycle_number, plan = left.popleft()
+            timed = self.config.every and plan.kind is Kind.STATIC and plan.cycle not in started
+            keys = started.setdefault(plan.cycle, [])
+            if self._may_start(plan):
+                measure = self._measure if self.simulated else self._measure_on_machine
+                keys += measure(plan, next(turns) if timed else 0)
+            if self._wish == CALIBRATE:
+                left.extendleft(self._calibration(self._cycle_number, plan))
+        if self._wish == ABORT:
+            names = [p.cycle for p in self.config.plans if not started.get(p.cycle)]
+            started = {cycle: keys for cycle, keys in started.items() if keys}
+            self._problem('ended as was asked for' + (
+                f'; not measured: {", ".join(names)}' if names else ''
+            ))
         self._status = 'finishing'
         self._close()
         self._judge(started)
@@ -274,6 +302,27 @@ class SessionNode(Node):
         request = ChangeState.Request(transition=Transition(id=transition))
         return self._call(self._change[driver], request, f'{driver}/change_state').success
 
+    def _may_start(self, plan: CyclePlan) -> bool:
+        """Wait until the cycle is asked for, where the session holds; whether it is."""
+        self._wish = ''
+        if self.hold:
+            self._held, self._status = plan.cycle, f'{plan.cycle} waits to be started'
+            self._say_cycle(plan, '`rtest ask start` starts it')
+            self.wait(lambda: bool(self._wish), math.inf)
+            self._held = ''
+            if self._wish != START:
+                return False
+            self._wish = ''
+        return True
+
+    def _calibration(self, number: int, plan: CyclePlan) -> list[tuple[int, CyclePlan]]:
+        """The nest calibration of the cycle's set-up after the cycle itself: the last is next."""
+        again = [
+            (n, one) for n, one in enumerate(self.config.plans, 1)
+            if one.kind is Kind.NEST_CALIBRATION and one.setup == plan.setup
+        ]
+        return again if plan.kind is Kind.NEST_CALIBRATION else [(number, plan), *again]
+
     def _tell_turn(self, plan: CyclePlan, due: int) -> None:
         """Say when a repeated cycle is to begin, or that it is late. due : [ns], 0 for at once."""
         text, late = turn(due, self._now()) if due else ('', False)
@@ -302,7 +351,7 @@ class SessionNode(Node):
             if progress.clock_stands(now, wall) > CLOCK_TIMEOUT_S:
                 raise SessionError(f'{plan.cycle}: the clock has stood still for '
                                    f'{CLOCK_TIMEOUT_S:.0f} s; is the simulated cell running?')
-            if key in self._cycles:
+            if key in self._cycles or self._wish == ABORT:
                 break
             done, poses = self._progress(key)
             if done:
@@ -323,10 +372,13 @@ class SessionNode(Node):
         """
         self._tell_turn(plan, due)
         self._wish = ''
+        self._following = True
         while (left := (due - self._now()) / NANOSECONDS) > 0.0:
-            if self.wait(lambda: self._wish == SKIP, left):
-                self._say_cycle(plan, f'{SKIP}, as was asked for')
+            if self.wait(lambda: self._wish in (SKIP, CALIBRATE, ABORT), left):
+                self._following = False
+                self._say_cycle(plan, f'{self._wish}, as was asked for')
                 return []
+        self._following = False
         device = self.config.devices.get('cnc')
         by_hand = device is None or device.programs == BY_HAND
         keys = []
@@ -593,13 +645,27 @@ class SessionNode(Node):
     def _on_wish(
         self, wish: str, _: Trigger.Request, response: Trigger.Response
     ) -> Trigger.Response:
-        response.success, response.message = self._following, self._status
-        # Otherwise it would be remembered, and meet a cycle that nobody meant.
-        if self._following:
-            self._wish = wish
+        refused = self._refuses(wish)
+        response.success = not refused
+        if refused:
+            response.message = f'{self._status}; {refused}'
         else:
-            response.message += '; there is nothing to repeat or skip'
+            cycle = self.config.plans[self._cycle_number - 1].cycle
+            self._wish, response.message = wish, f'{cycle} {GRANTED[wish]}'
         return response
+
+    def _refuses(self, wish: str) -> str:
+        """Why a wish cannot be granted; '' where it can."""
+        if wish == START:
+            return '' if self._held else 'no cycle waits to be started'
+        if self._held:
+            return 'there is nothing to repeat' if wish == REPEAT else ''
+        # A simulated cycle needs nobody, and goes on to its end before a calibration. Otherwise a
+        # wish would be remembered, and meet a cycle that nobody meant.
+        interrupts = wish in (REPEAT, SKIP)
+        if self._following or (self.simulated and self._open and not interrupts):
+            return ''
+        return f'there is nothing to {"repeat or skip" if interrupts else wish}'
 
     def _diagnose(self) -> None:
         level = diagnostics.WARN if self._problems else diagnostics.OK
@@ -610,6 +676,7 @@ class SessionNode(Node):
             'cycle': self._cycle_number,
             'cycles': len(self.config.plans),
             'problems': len(self._problems),
+            'waits_for_start': self._held,
         }
         self._diagnostics.publish(diagnostics.status('session: progress', level, text, values))
 

@@ -68,6 +68,11 @@ class Projection:
                 f'these {len(rows.residual)} poses show no effect of the library; measure more '
                 'poses, or see in `rtest info` why so many are missing'
             )
+        if self.freedom <= max(c.basis.shape[1] for c in self.candidates):
+            raise UserError(
+                f'{len(rows.residual)} poses are too few to compare with the model; measure more, '
+                'or see in `rtest info` why so many are missing'
+            )
         # How many the library offers; refined shapes come to them.
         self.offered = len(self.candidates)
         self.keys = len({c.effect.key for c in self.candidates})
@@ -193,6 +198,9 @@ class Projection:
         k = self.candidates[index].basis.shape[1]
         used = sum(self.candidates[i].basis.shape[1] for i in given) + k
         free = self.freedom - used
+        if free <= 0:
+            # Nothing is left to tell it from noise.
+            return 1.0
         return float(stats.f.sf(more / k / (rest / free), k, free))
 
     def threshold(self, seed: int = 1) -> np.ndarray:

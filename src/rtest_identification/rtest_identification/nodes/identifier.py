@@ -7,6 +7,7 @@ from rclpy.node import Node
 from rtest_msgs.msg import Cycle, ErrorMap, LocationErrors, ModelGap, NestCalibration
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
+from visualization_msgs.msg import MarkerArray
 
 from rtest_estimation import messages
 from rtest_estimation.attempts import counted
@@ -22,6 +23,7 @@ from rtest_identification.gap.offline import gap_session
 from rtest_identification.gap.output import summary
 from rtest_identification.machine import Machine, parse_machine
 from rtest_identification.nodes import publish
+from rtest_identification.nodes.markers import position_markers
 from rtest_identification.observations import turns
 from rtest_identification.pipeline import Identification, identify
 
@@ -37,6 +39,7 @@ class IdentifierNode(Node):
         self._problem = 'waiting for the machine'
         self._location = self.create_publisher(LocationErrors, 'rtest/location_errors', LATCHED)
         self._map = self.create_publisher(ErrorMap, 'rtest/error_map', LATCHED_100)
+        self._markers = self.create_publisher(MarkerArray, 'rtest/markers', LATCHED)
         self._diagnostics = diagnostics.Diagnostics(self)
         self._gap = self.create_publisher(ModelGap, 'rtest/model_gap', LATCHED)
         model = self.declare_parameter('model', '').value
@@ -93,6 +96,7 @@ class IdentifierNode(Node):
             self._map.publish(publish.error_map(result, axis_map, stamp))
         if result.inner_map is not None:
             self._map.publish(publish.grid_map(result, result.inner_map, stamp))
+        self._markers.publish(position_markers(result, stamp))
 
     def _on_finish(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         if self._cycles and not any(c.plan.kind is Kind.STATIC for c in self._cycles):
@@ -140,7 +144,10 @@ class IdentifierNode(Node):
 
     def _report(self) -> None:
         warnings = self._result.warnings if self._result else ()
-        level = diagnostics.WARN if warnings or self._problem else diagnostics.OK
+        # Waiting is no fault, what cannot be identified is.
+        static = any(c.plan.kind is Kind.STATIC for c in self._cycles)
+        wrong = warnings or (self._problem and (static or self._machine is None))
+        level = diagnostics.WARN if wrong else diagnostics.OK
         values = {f'warning {n + 1}': text for n, text in enumerate(warnings)}
         self._diagnostics.publish(
             diagnostics.status('identifier: session', level, self._summary(), values)

@@ -1,0 +1,126 @@
+"""Readings while everything stands still: how much they scatter, at which frequencies.
+
+A line in their spectrum has a cause that can be mended: mains hum, a spindle or a pump that runs.
+Frequencies above half the rate of the readings appear folded below it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import signal
+
+from rtest_estimation.records import Feedback, GaugeBlock, Status
+
+# Feedback that moves by no more from one message to the next stands still [m], [rad].
+STILL = 2e-6
+# A line of this height or more is chance in one of so many spectra.
+_CHANCE = 0.01
+# Drifts and what a window of Hann smears out of them lie in the first bins.
+_FIRST_BIN = 4
+
+
+@dataclass(frozen=True)
+class Line:
+    """A line of a spectrum. frequency : [Hz]; amplitude : half of peak to peak [m]."""
+
+    frequency: float
+    amplitude: float
+
+
+@dataclass(frozen=True)
+class Standing:
+    """Readings of all gauges over a stretch in which all axes stood still.
+
+    rate : [1/s]; readings : (n, gauges) [m], evenly spaced
+    """
+
+    rate: float
+    readings: np.ndarray
+
+    @property
+    def duration(self) -> float:
+        """[s]."""
+        return len(self.readings) / self.rate
+
+    @property
+    def resolution(self) -> float:
+        """Distance of two frequencies that a window of Hann still separates [Hz]."""
+        return 2.0 / self.duration
+
+    @property
+    def noise(self) -> np.ndarray:
+        """(gauges,) standard deviation of single readings about a straight line [m]."""
+        return signal.detrend(self.readings, axis=0).std(axis=0, ddof=2)
+
+    @property
+    def drift(self) -> np.ndarray:
+        """(gauges,) slope [m/s]."""
+        times = np.arange(len(self.readings)) / self.rate
+        return np.polyfit(times, self.readings, 1)[0]
+
+    def lines(self, gauge: int) -> list[Line]:
+        """Lines that stand out of a gauge's noise, the strongest first.
+
+        The periodogram of white noise is exponentially distributed about its mean, which is its
+        median over ln 2. A line is a local maximum so high that one of n bins reaches it by
+        chance with `_CHANCE`: mean times ln(n / chance).
+        """
+        frequency, power = signal.periodogram(
+            signal.detrend(self.readings[:, gauge]), self.rate, 'hann', scaling='spectrum'
+        )
+        power = power[_FIRST_BIN:]
+        if len(power) < 8:
+            return []
+        threshold = np.median(power) / np.log(2.0) * np.log(len(power) / _CHANCE)
+        peaks, _ = signal.find_peaks(
+            np.concatenate([[0.0], power, [0.0]]), height=threshold, distance=3
+        )
+        found = [
+            Line(float(frequency[p - 1 + _FIRST_BIN]), float(np.sqrt(2.0 * power[p - 1])))
+            for p in peaks
+        ]
+        return sorted(found, key=lambda line: -line.amplitude)
+
+
+def folded(frequency: float, rate: float) -> float:
+    """Where a frequency appears in readings at this rate [Hz]."""
+    return abs(frequency - rate * round(frequency / rate))
+
+
+def longest_standing(
+    gauges: Sequence[GaugeBlock], feedback: Sequence[Feedback]
+) -> Standing | None:
+    """The longest stretch with all axes still and all gauges valid; None without any.
+
+    Readings are brought to even spacing by linear interpolation, which serial lines need.
+    """
+    times = np.array([one.stamp for one in feedback], dtype=np.int64)
+    if len(times) < 2 or not gauges:
+        return None
+    positions = np.array([one.position for one in feedback])
+    moving = times[1:][np.abs(np.diff(positions, axis=0)).max(axis=1) > STILL]
+    channels = gauges[0].displacement.shape[1]
+    blocks = [one for one in gauges if one.displacement.shape[1] == channels]
+    stamps = np.concatenate([one.stamps for one in blocks])
+    readings = np.concatenate([one.displacement for one in blocks])
+    valid = np.concatenate([(one.status == Status.VALID).all(axis=1) for one in blocks])
+    inside = (stamps >= times[0]) & (stamps <= times[-1])
+    good = valid & inside & np.isfinite(readings).all(axis=1)
+    # A stretch ends with a motion and with a reading that is not good.
+    part = np.searchsorted(moving, stamps) + np.cumsum(~good)
+    part, stamps, readings = part[good], stamps[good], readings[good]
+    if not len(part):
+        return None
+    names, counts = np.unique(part, return_counts=True)
+    chosen = part == names[counts.argmax()]
+    stamps, readings = (stamps[chosen] - stamps[chosen][0]) * 1e-9, readings[chosen]
+    if len(stamps) < 16 or stamps[-1] <= 0.0:
+        return None
+    even = np.linspace(0.0, stamps[-1], len(stamps))
+    return Standing(
+        (len(stamps) - 1) / float(stamps[-1]),
+        np.column_stack([np.interp(even, stamps, column) for column in readings.T]),
+    )

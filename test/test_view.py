@@ -1,0 +1,316 @@
+"""The page of `rtest session --view` in a browser, beside a simulated session."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+
+from rtest_drivers.config import config_path
+from rtest_drivers.domain import free_domain
+from rtest_estimation.bagfile import read_bag
+
+CHROMIUM = shutil.which('chromium')
+
+pytestmark = [
+    pytest.mark.graph,
+    pytest.mark.skipif(
+        not (find_spec('rclpy') and find_spec('rtest_msgs')), reason='needs ROS 2 and rtest_msgs'
+    ),
+    pytest.mark.skipif(
+        CHROMIUM is None or find_spec('playwright') is None,
+        reason='needs chromium (tools/install_chromium.sh) and playwright',
+    ),
+]
+
+CONFIG = """
+machine: {machine}
+cycle: {{b_deg: [-40, 0, 40], c_deg: [0, 120, 240], dwell_s: 0.3}}
+nest_calibration: {{step_mm: 1.0, dwell_s: 0.3}}
+setups:
+  1a: {{sphere_mm: [0, -90.0, 40.6]}}
+  2b: {{sphere_mm: [0, 0, 140.6]}}
+"""
+# Of waiting for what a loaded computer may do slowly [ms].
+PATIENCE = 60_000
+# Pose 4 of the static cycle is not driven to.
+FAULT = '\nfaults:\n  - {kind: pose_skipped, cycle: 1a-static, pose: 4}\n'
+
+
+class Graph:
+    """A session with a page, the page in a browser, and a listener to the topics."""
+
+    def __init__(self, folder: Path, page, address: str, process: subprocess.Popen, domain: int):
+        self.folder, self.page, self.address = folder, page, address
+        self.process, self.domain = process, domain
+
+    def answer(self) -> str:
+        return self.page.inner_text('#answer')
+
+    def tap(self, wish: str) -> str:
+        """Tap a control, twice where it asks whether one is sure; the answer."""
+        button = self.page.locator(f'[data-wish={wish}]')
+        button.click()
+        if 'sure' in (button.get_attribute('class') or ''):
+            button.click()
+        self.page.wait_for_selector('#answer.ok, #answer.error')
+        return self.answer()
+
+    def pid(self, name: str) -> int:
+        """Process id of a node of this session."""
+        for entry in Path('/proc').glob('[0-9]*'):
+            try:
+                words = (entry / 'cmdline').read_bytes().decode(errors='replace').split('\0')
+                here = Path(os.readlink(entry / 'cwd')) == self.folder
+            except OSError:
+                continue
+            if here and f'rtest_drivers.nodes.{name}' in words:
+                return int(entry.name)
+        raise LookupError(name)
+
+
+@pytest.fixture(scope='module')
+def graph(tmp_path_factory) -> Iterator[Graph]:
+    from playwright.sync_api import sync_playwright
+
+    folder = tmp_path_factory.mktemp('view')
+    config, truth = folder / 'short.yaml', folder / 'truth.yaml'
+    config.write_text(CONFIG.format(machine=config_path('nmv1500dcg.yaml')))
+    truth.write_text(config_path('cell_demo.yaml').read_text().replace(
+        'machine: nmv1500dcg.yaml', f'machine: {config_path("nmv1500dcg.yaml")}'
+    ) + FAULT)
+    domain = free_domain()
+    process = subprocess.Popen(
+        [
+            sys.executable, '-m', 'rtest_drivers.cli', 'session', '--config', str(config),
+            '--simulate', str(truth), '--session', 'short', '--out', str(folder / 'out'),
+            '--domain', str(domain), '--hold', '--view', '--port', '0',
+        ],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=folder,
+    )
+    try:
+        address = next(
+            (found[1] for line in process.stdout if (found := re.search(r'page: (\S+)', line))),
+            None,
+        )
+        assert address, process.stderr.read()
+        with sync_playwright() as playwright:
+            browser = playwright.chromium.launch(
+                executable_path=CHROMIUM, args=['--no-sandbox']
+            )
+            page = browser.new_page(viewport={'width': 1280, 'height': 900})
+            page.set_default_timeout(PATIENCE)
+            errors: list[str] = []
+            page.on('pageerror', lambda error: errors.append(str(error)))
+            # That the server ends before the browser is no error of the page.
+            page.on(
+                'console', lambda line: 'net::ERR' in line.text or errors.append(line.text)
+            )
+            page.goto(address)
+            page.wait_for_selector("#doing:has-text('waits to be started')")
+            yield Graph(folder, page, address, process, domain)
+            assert not errors
+            browser.close()
+    finally:
+        if process.poll() is None:
+            process.send_signal(signal.SIGINT)
+        process.communicate(timeout=60)
+
+
+@pytest.fixture(scope='module')
+def topics(graph) -> Iterator:
+    """Last message of each topic, heard by a node of the test's own."""
+    import rclpy
+    from rclpy.context import Context
+    from rclpy.executors import SingleThreadedExecutor
+    from rtest_msgs.msg import Cycle, GaugeSamples, LocationErrors
+    from sensor_msgs.msg import JointState
+    from std_msgs.msg import String
+
+    from rtest_estimation.nodes.qos import LATCHED_100
+
+    context = Context()
+    rclpy.init(context=context, domain_id=graph.domain)
+    node = rclpy.create_node('listener', context=context, use_global_arguments=False)
+    heard: dict[str, list] = {}
+    for name, kind, qos in (
+        ('gauges', GaugeSamples, 1), ('cnc/feedback', JointState, 1),
+        ('cycle', Cycle, LATCHED_100), ('location_errors', LocationErrors, LATCHED_100),
+        ('mark', String, LATCHED_100),
+    ):
+        heard[name] = []
+        node.create_subscription(kind, f'rtest/{name}', heard[name].append, qos)
+    executor = SingleThreadedExecutor(context=context)
+    executor.add_node(node)
+
+    class Topics:
+        def __init__(self) -> None:
+            self.node = node
+
+        def next(self, name: str, meant=lambda message: True) -> object:
+            """The second message from now on of a stream, of a latched topic that meant."""
+            streamed = name in ('gauges', 'cnc/feedback')
+            if streamed:
+                heard[name].clear()
+            deadline = time.monotonic() + PATIENCE / 1e3
+            while time.monotonic() < deadline:
+                executor.spin_once(timeout_sec=0.1)
+                if len(heard[name]) > streamed and meant(heard[name][-1]):
+                    break
+            return heard[name][-1]
+
+        def spin(self, seconds: float) -> None:
+            end = time.monotonic() + seconds
+            while time.monotonic() < end:
+                executor.spin_once(timeout_sec=0.05)
+
+    yield Topics()
+    executor.shutdown()
+    node.destroy_node()
+    rclpy.shutdown(context=context)
+
+
+def figure(text: str) -> float:
+    return float(text.replace('−', '-'))
+
+
+def test_values_on_the_page_are_those_on_the_topics(graph, topics) -> None:
+    page = graph.page
+    assert '1a-nest starts' in graph.tap('start')
+    page.wait_for_selector("#cycles button:has-text('1a-nest ✓')")
+    page.wait_for_selector("#doing:has-text('1a-static waits')")
+    # The machine stands still now; the gauges scatter by 0.1 µm.
+    block = topics.next('gauges')
+    readings = [1e6 * d for d in block.displacement[-block.channels:]]
+    shown = [figure(t) for t in page.locator('#gauges .figure').all_inner_texts()]
+    assert shown == pytest.approx(readings, abs=2.0)
+    feedback = topics.next('cnc/feedback')
+    for name, value in zip(feedback.name, feedback.position, strict=True):
+        row = page.inner_text(f'[data-axis={name}] .figure')
+        scale = 180 / 3.141592653589793 if name in 'BCS' else 1e3
+        assert figure(row) == pytest.approx(value * scale, abs=1e-3)
+    assert page.get_attribute('[data-device=cnc]', 'data-level') == 'ok'
+    assert '50.' in page.inner_text('[data-device=gauges] td:last-child') or '49.' in \
+        page.inner_text('[data-device=gauges] td:last-child')
+
+
+def test_a_wish_that_cannot_be_granted_is_refused_with_the_reason(graph) -> None:
+    assert 'Refused' in (said := graph.tap('repeat'))
+    assert 'nothing to repeat' in said
+
+
+def test_a_mark_is_on_the_topic_and_on_the_page(graph, topics) -> None:
+    graph.page.fill('#mark-text', 'door opened')
+    graph.page.click('#mark button')
+    graph.page.wait_for_selector("#recording dd:has-text('door opened')")
+    assert topics.next('mark').data == 'door opened'
+
+
+def test_a_device_that_hangs_is_shown_and_so_is_its_return(graph) -> None:
+    page, pid = graph.page, graph.pid('gauges')
+    page.wait_for_selector('[data-device=gauges][data-level=ok]')
+    os.kill(pid, signal.SIGSTOP)
+    try:
+        page.wait_for_selector('[data-device=gauges][data-level=error]')
+        assert page.inner_text('[data-device=gauges] .badge') == 'ERROR'
+        page.wait_for_selector('#gauges .figure.old')
+    finally:
+        os.kill(pid, signal.SIGCONT)
+    page.wait_for_selector('[data-device=gauges][data-level=ok]')
+
+
+def connections(node) -> dict[str, tuple[int, int]]:
+    """Publishers and subscriptions of every topic."""
+    return {
+        name: (node.count_publishers(name), node.count_subscribers(name))
+        for name, _ in node.get_topic_names_and_types()
+    }
+
+
+def test_opening_and_closing_the_page_changes_nothing_in_the_graph(graph, topics) -> None:
+    before = None
+    # Until the listener knows the whole graph.
+    while before != (now := (connections(topics.node), sorted(topics.node.get_node_names()))):
+        before = now
+        topics.spin(1.5)
+    other = graph.page.context.browser.new_page()
+    other.goto(graph.address)
+    other.wait_for_selector('[data-device=gauges][data-level=ok]', timeout=PATIENCE)
+    topics.spin(0.5)
+    assert (connections(topics.node), sorted(topics.node.get_node_names())) == before
+    other.close()
+    topics.spin(0.5)
+    assert (connections(topics.node), sorted(topics.node.get_node_names())) == before
+
+
+def test_calibrating_measures_the_nest_again_and_then_the_cycle(graph) -> None:
+    page = graph.page
+    assert 'Done' in graph.tap('calibrate')
+    page.wait_for_selector("#doing:has-text('1a-nest waits')")
+    graph.tap('start')
+    page.wait_for_selector("#doing:has-text('1a-static waits')")
+    assert page.locator("#cycles button:has-text('1a-nest ✓')").count() == 2
+
+
+def test_topics_without_ros_tools(graph) -> None:
+    from rtest_drivers.nodes.topics import looker
+
+    with looker(graph.domain) as look:
+        text = next(look.messages('/rtest/machine', 1))
+        assert text.startswith('data: ') and 'chain' in text
+        rate = look.rates('rtest/gauges', 2.0)['/rtest/gauges']
+        assert rate.messages > 1 and rate.rate == rate.messages / 2.0 and rate.longest_gap > 0.0
+        found = {one.name: one for one in look.topics()}
+        assert found['/rtest/gauges'].type == 'rtest_msgs/msg/GaugeSamples'
+        assert found['/rtest/gauges'].publishers == 1
+        # The recorder, the estimator and the page.
+        assert found['/rtest/gauges'].subscriptions >= 3
+
+
+def test_results_and_missing_poses_are_shown(graph, topics) -> None:
+    page = graph.page
+    assert '1a-static starts' in graph.tap('start')
+    page.wait_for_selector('#location tbody tr')
+    errors = topics.next('location_errors')
+    rows = page.locator('#location tbody tr').all_inner_texts()
+    assert len(rows) == len(errors.symbols)
+    for row, symbol, value in zip(rows, errors.symbols, errors.values, strict=True):
+        name, shown, *_ = row.split('\t')
+        assert name == symbol
+        assert figure(shown) == pytest.approx(1e6 * value, abs=0.0051)
+    cycle = topics.next('cycle', lambda message: message.plan.cycle == '1a-static')
+    assert list(cycle.missing) == [4]
+    missing = page.inner_text('#missing')
+    assert missing.startswith('Pose 4 (') and ': ' in missing and not missing.endswith('missing')
+    assert page.locator('#poses button.missing').count() == 1
+    assert page.locator('#poses button.done').count() == len(cycle.points)
+    assert '×' in page.inner_text('#picture-factor')
+    # Something was drawn: not every pixel is transparent.
+    assert page.evaluate(
+        "() => { const c = document.querySelector('#picture'); "
+        "return c.getContext('2d').getImageData(0, 0, c.width, c.height).data.some((v) => v); }"
+    )
+
+
+def test_the_session_ended_from_the_page_is_closed_and_holds_the_mark(graph) -> None:
+    graph.page.wait_for_selector("#doing:has-text('2b-nest waits')")
+    assert 'Done' in graph.tap('abort')
+    said = []
+    for line in graph.process.stdout:
+        said.append(line)
+        if 'recorder: recorded' in line:
+            break
+    assert any('not measured: 2b-nest, 2b-static' in line for line in said)
+    graph.page.wait_for_selector("#link:has-text('NO CONNECTION')")
+    bag = read_bag(graph.folder / 'out' / 'short', ['std_msgs/msg/String'])
+    assert bag.closed
+    assert [mark.data for mark in bag.messages('/rtest/mark')] == ['door opened']
