@@ -588,7 +588,10 @@ class SessionNode(Node):
         if message.plan.session == self.session:
             stamp = message.plan.header.stamp
             key = (message.plan.cycle, stamp.sec * NANOSECONDS + stamp.nanosec)
-            self._cycles[key] = message
+            known = self._cycles.get(key)
+            # Somebody else's estimator may take our plans too, and have nothing to say of them.
+            if known is None or len(message.points) > len(known.points):
+                self._cycles[key] = message
 
     def _on_nest(self, message: NestCalibration) -> None:
         self._nests[message.calibration] = message
