@@ -19,8 +19,8 @@ lint: setup
 # The graphs of the tests must not join that of a machine in the same network.
 test: export ROS_AUTOMATIC_DISCOVERY_RANGE ?= LOCALHOST
 test: setup lint linuxcnc chromium
-	$(BIN)/python -m pytest -m "not graph" -n 2 --dist loadfile
-	$(BIN)/python -m pytest -m graph
+	$(BIN)/python -m pytest -m "not graph and not alone" -n 2 --dist loadfile
+	$(BIN)/python -m pytest -m "graph or alone"
 
 # For the tests on a real controller, which are skipped without it.
 linuxcnc:

@@ -61,6 +61,8 @@ def make_session(path: Path, minutes: float) -> None:
         plans.append(static(machine, name, np.array(sphere), outer, inner))
     poses = sum(len(plan.commands) for plan in plans)
     dwell = minutes * 60.0 / (poses + len(plans)) - MOVE_S
+    if dwell < 0.2:
+        sys.exit(f'--minutes {minutes:g}: too short for {poses} poses')
     rng = np.random.default_rng(1)
     store, writer, channels, file = _open(path)
     _write(writer, channels['/rtest/machine'], START,

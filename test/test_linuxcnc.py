@@ -19,7 +19,9 @@ from rtest_estimation.errors import UserError
 from rtest_estimation.records import CyclePlan, Feedback, Kind
 from rtest_identification.session_file import load_session
 
-pytestmark = pytest.mark.skipif(bool(missing()), reason=missing())
+pytestmark = [
+    pytest.mark.alone, pytest.mark.skipif(bool(missing()), reason=missing()),
+]
 
 SESSION = """
 machine: {machine}

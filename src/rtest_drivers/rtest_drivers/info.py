@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from datetime import datetime, timezone
 from pathlib import Path
+from typing import Any
 
 from rtest_drivers.provenance import TOPIC
 from rtest_estimation.bagfile import Bag, read_bag
@@ -36,7 +37,7 @@ def describe(path: str | Path, topics: Mapping[str, str] | None = None) -> list[
     else:
         finished = estimate_recording(recording)
         lines += _session_lines(recording) + _missing_lines(finished)
-        warnings = (*recording.warnings, *_problems(finished))
+        warnings = (*recording.warnings, *_problems(finished), *_not_begun(bag, recording))
     lines += _software_lines(bag)
     return lines + _topic_lines(bag) + [f'warning   {warning}' for warning in warnings]
 
@@ -52,17 +53,44 @@ def _file_lines(bag: Bag) -> list[str]:
     return [*lines, f'closed    {"yes" if bag.closed else "no"}']
 
 
-def _software_lines(bag: Bag) -> list[str]:
-    """By which code the session was measured, where the recording says it."""
+def _configuration(bag: Bag, key: str) -> dict[str, Any] | None:
+    """A mapping of what the session recorded of itself; None where it did not.
+
+    Raises UserError where it cannot be read.
+    """
     for topic, (kind, _) in bag.topics.items():
         if topic.endswith(f'/{TOPIC}') and kind == 'std_msgs/msg/String':
             for message in bag.messages(topic):
-                try:
-                    found = load_yaml(message.data, topic)['software'].items()
-                    return [f'software  {package} {version}' for package, version in found]
-                except (UserError, AttributeError, KeyError, TypeError):
-                    return [f'software  {topic} cannot be read']
-    return []
+                data = load_yaml(message.data, topic)
+                found = data.get(key, {}) if isinstance(data, dict) else None
+                if not isinstance(found, dict):
+                    raise UserError(f'{topic} cannot be read')
+                return found
+    return None
+
+
+def _software_lines(bag: Bag) -> list[str]:
+    """By which code the session was measured, where the recording says it."""
+    try:
+        found = _configuration(bag, 'software') or {}
+    except UserError as error:
+        return [f'software  {error}']
+    return [f'software  {printable(f"{package} {version}")}' for package, version in found.items()]
+
+
+def _not_begun(bag: Bag, recording: Recording) -> list[str]:
+    """Cycles that were to be measured and were not begun: a session that was cut short."""
+    try:
+        wanted = _configuration(bag, 'cycles') or {}
+    except UserError:
+        # Told with the software.
+        return []
+    begun = {plan.cycle for plan in recording.plans}
+    left = [printable(str(name)) for name in wanted if name not in begun]
+    if not left:
+        return []
+    poses = sum(n for name, n in wanted.items() if name not in begun and isinstance(n, int))
+    return [f'the session ended before {", ".join(left)}: {poses} poses were not begun']
 
 
 def _session_lines(recording: Recording) -> list[str]:

@@ -16,16 +16,20 @@ PACKAGES = ('rtest_drivers', 'rtest_identification', 'rtest_estimation')
 _LIBRARIES = ('numpy', 'scipy', 'rosbags', 'mcap', 'ros-rclpy')
 
 
-def provenance(session: str, config: Path, devices: Mapping[str, Path]) -> str:
+def provenance(
+    session: str, config: Path, devices: Mapping[str, Path], cycles: Mapping[str, int]
+) -> str:
     """Text that is recorded on the topic `TOPIC` at the start of a session.
 
     session : name; config : session file; devices : device file by driver
+    cycles : poses of every cycle that is to be measured
     """
     return yaml.safe_dump(
         {
             'session': session,
             'software': {package: code_version(package) for package in PACKAGES},
             'libraries': {'python': platform.python_version(), **_libraries()},
+            'cycles': dict(cycles),
             'session_file': _file(config),
             'devices': {name: _file(path) for name, path in devices.items()},
         },

@@ -25,6 +25,8 @@ from rtest_drivers.cnc.linuxcnc_protocol import (
 from rtest_drivers.sim.cnc_devices import LinuxCncServer
 from rtest_estimation.errors import UserError
 
+pytestmark = pytest.mark.alone
+
 # As a LinuxCNC 2.9.0 sent them.
 POSITION = b'JOINT_POS 4.968391 -10.125581 -60.603529 30.000000 40.000000 0.000000\r\n'
 FILE = """

@@ -26,6 +26,8 @@ from rtest_drivers.cnc.mtconnect_xml import (
 )
 from rtest_drivers.sim.cnc_devices import MtConnectAgent
 
+pytestmark = pytest.mark.alone
+
 # In the shape the standard gives (ANSI/MTC1.4, part 1: header, part 3: streams).
 STREAMS = b"""<?xml version="1.0" encoding="UTF-8"?>
 <MTConnectStreams xmlns:m="urn:mtconnect.org:MTConnectStreams:1.3"

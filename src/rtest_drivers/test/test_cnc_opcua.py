@@ -15,6 +15,8 @@ from rtest_drivers.cnc.check import check
 from rtest_drivers.cnc.opcua import OpcUa, estop_state, position, source_time
 from rtest_drivers.sim.cnc_devices import OpcUaServer
 
+pytestmark = pytest.mark.alone
+
 # In the style of a SINUMERIK: position of the first encoder of machine axes 1 and 4.
 X = AxisSource('X', 'ns=2;s=x', 'mm')
 NODES = {

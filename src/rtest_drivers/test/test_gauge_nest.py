@@ -32,6 +32,8 @@ from rtest_drivers.sim.gauge_devices import (
 )
 from rtest_estimation.records import GaugeBlock, Status
 
+pytestmark = pytest.mark.alone
+
 NAMES = {
     Lkg: 'keyence-lkg',
     Lkg5000: 'keyence-lkg5000',

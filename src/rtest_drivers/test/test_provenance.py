@@ -40,14 +40,14 @@ def test_the_code_is_told_apart(tmp_path, monkeypatch):
 
 
 def test_session_and_device_files_are_in_it_word_for_word(tmp_path):
-    found = yaml.safe_load(provenance('monday', SESSION, {'gauges': SESSION}))
+    found = yaml.safe_load(provenance('monday', SESSION, {'gauges': SESSION}, {}))
     assert found['session'] == 'monday'
     assert found['session_file'] == {'path': str(SESSION), 'text': SESSION.read_text()}
     assert found['devices']['gauges'] == found['session_file']
     assert found['software']['rtest_drivers'] == code_version('rtest_drivers')
     assert found['libraries']['numpy'] == np.__version__
     # As it is recorded: CDR of a std_msgs/String.
-    text = provenance('monday', SESSION, {}).encode() + b'\0'
+    text = provenance('monday', SESSION, {}, {'1a-nest': 28}).encode() + b'\0'
     definition = MessageTypes().definition('std_msgs/msg/String')
     bag = McapFile(tmp_path / 'bag')
     bag.add_topic('/rtest/configuration', definition.name, definition.text, definition.type_hash)
@@ -85,3 +85,11 @@ def test_its_own_calibration_given_changes_nothing():
     with pytest.raises(UserError, match='no nest calibration of set-up .*, there is '):
         plans = read_recording(SHORT).plans
         nests_of(SHORT, [dataclasses.replace(plans[0], setup='elsewhere')])
+
+
+def test_cycles_that_were_not_begun_are_told(tmp_path, monkeypatch):
+    """A session that was killed in its second cycle."""
+    wanted = {'outer-nest': 28, 'outer-static': 27, 'third': 30, 'fourth': 12}
+    monkeypatch.setattr('rtest_drivers.info._configuration', lambda bag, key: wanted)
+    lines = '\n'.join(describe(SHORT))
+    assert 'third, fourth: 42 poses were not begun' in lines

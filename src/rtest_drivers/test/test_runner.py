@@ -5,6 +5,7 @@ from __future__ import annotations
 import fcntl
 import mmap
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -26,6 +27,8 @@ from rtest_drivers.graph import (
 from rtest_drivers.processes import remove_dead_shared_memory, remove_dead_sockets, stop
 from rtest_drivers.runner import Command, NodeFailed, run
 from rtest_estimation.errors import UserError
+
+pytestmark = pytest.mark.alone
 
 # Says that it is there, and when it was asked to stop.
 NODE = """
@@ -61,7 +64,8 @@ def wait_for(condition, timeout: float = 20.0):
 
 
 def pid_in(log: Path) -> int:
-    wait_for(lambda: log.exists() and 'pid' in log.read_text())
+    # A whole line.
+    wait_for(lambda: log.exists() and re.match(r'pid \d+\n', log.read_text()))
     return int(log.read_text().split()[1])
 
 

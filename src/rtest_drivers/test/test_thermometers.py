@@ -14,6 +14,8 @@ from rtest_drivers.thermometers.config import load_thermometers
 from rtest_drivers.thermometers.serial_thermometers import SerialThermometers
 from rtest_estimation.errors import UserError
 
+pytestmark = pytest.mark.alone
+
 FILE = r"""
 controllers:
   - port: PORT

@@ -210,7 +210,8 @@ def find_files(path: Path, warnings: list[str]) -> tuple[tuple[Path, ...], str]:
             raise UserError(f'{file}: leads out of the recording; name that file if it is meant')
     if not files:
         inside = sorted(entry.parent.name for entry in path.glob('*/*.mcap'))
-        hint = f'; name one of its recordings: {", ".join(inside[:5])}' if inside else ''
+        names = ', '.join([*inside[:9], *(['...'] if inside[9:] else [])])
+        hint = f'; name one of its recordings: {names}' if inside else ''
         raise UserError(f'{path}: no recording in this directory{hint}')
     return tuple(files), 'mcap' if all(file.suffix == '.mcap' for file in files) else 'other'
 

@@ -32,6 +32,8 @@ _REPEATED = re.compile(r'(.*-thermal)-\d+')
 # A dynamic cycle rests so long where it turns round: the readings have settled, and the end of the
 # cycle is seen by half of it [s].
 DYNAMIC_REST = 1.0
+# Nearer to the axis the sphere makes no circle to speak of [m].
+_NEAREST = 1e-3
 
 
 def nest_calibration(
@@ -224,11 +226,23 @@ def dynamic(
 
     speed : [rad/s]; turns : each way, from zero upwards where the range allows it, else as far on
         both sides of zero
+
+    Raises UserError where the sphere lies on the axis.
     """
     travel = 2.0 * math.pi * turns
     start = 0.0 if travel <= machine.axes[axis].upper + 1e-9 else -0.5 * travel
     rows = np.zeros((3, len(machine.letters)))
     rows[:, machine.letters.index(axis)] = start, start + travel, start
+    half = np.zeros((2, len(machine.letters)))
+    half[1, machine.letters.index(axis)] = math.pi
+    radius = 0.5 * float(np.linalg.norm(np.diff(linear_positions(machine, sphere, half), axis=0)[
+        0, [machine.letters.index(name) for name in machine.linear]
+    ]))
+    if radius < _NEAREST:
+        raise UserError(
+            f'the sphere lies {radius * 1e3:.2f} mm from the axis {axis}: nothing follows it; put '
+            'it farther out'
+        )
     # The path speed of a motion that a rotary axis leads, for a person in deg/min.
     name = f'dynamic-{math.degrees(speed) * 60.0:.0f}'
     commands = linear_positions(machine, sphere, rows)

@@ -172,7 +172,10 @@ def load_session(path: Path | str, kind: str | None = None) -> SessionConfig:
         if kind in _BUILD:
             cycle = _BUILD[kind](machine, name, sphere, *stations, dwell)
             plans += thermal(cycle, repetitions) if kind == THERMAL else [cycle]
-        plans += [dynamic(machine, name, sphere, *each) for each in turning]
+        try:
+            plans += [dynamic(machine, name, sphere, *each) for each in turning]
+        except UserError as error:
+            raise UserError(f'{path}: setups: {name}: {error}') from None
     for plan in plans:
         try:
             check_ranges(machine, plan)

@@ -65,7 +65,14 @@ def laser_checks(
     plans = []
     if kind is NestKind.LASER and reader.data.get('verification') is not None:
         section = reader.section('verification', {'edge_mm', 'dwell_s'})
-        edge = section.number('edge_mm', 1.0, _EDGE_MM) * 1e-3
+        cube = reader.section('nest_calibration', {'edge_mm', 'dwell_s'})
+        largest = cube.number('edge_mm', 1.0, _EDGE_MM)
+        edge = section.number('edge_mm', min(1.0, largest), _EDGE_MM) * 1e-3
+        if edge > largest * 1e-3 + 1e-9:
+            raise UserError(
+                f'{section.where}: edge_mm: {edge * 1e3:g} is beyond the calibrated cube of '
+                f'{largest:g} mm, outside which there are no centres'
+            )
         dwell = section.number('dwell_s', 0.2, DWELL_S)
         plans.append(laser_verification(machine, setup, sphere, edge, dwell))
     if kind is NestKind.LASER and reader.data.get('scan') is not None:
@@ -89,6 +96,8 @@ def _directions(reader: Reader) -> list[np.ndarray]:
             f'{nest.where}: directions: expected a list of {{azimuth_deg, tilt_deg}}, which a '
             'scan needs'
         )
+    if not 3 <= len(entries) <= 4:
+        raise UserError(f'{nest.where}: directions: expected three or four, got {len(entries)}')
     found = []
     for number, entry in enumerate(entries, start=1):
         where = f'{nest.where}: directions: {number}'

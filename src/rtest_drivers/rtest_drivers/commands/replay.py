@@ -30,7 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--start', type=float, default=0.0, metavar='S',
                         help='begin S seconds after the first message; plans and machine from '
                         'before are published all the same')
-    parser.add_argument('--stop', type=float, default=0.0, metavar='S',
+    parser.add_argument('--stop', type=float, metavar='S',
                         help='end S seconds after the first message')
     parser.add_argument('--loop', action='store_true', help='begin anew at the end, until Ctrl-C')
     parser.add_argument('--pause', action='store_true',
@@ -54,6 +54,8 @@ def run(arguments: argparse.Namespace) -> int:
     from rtest_drivers.graph import check_remaps
     from rtest_drivers.runner import need_ros
 
+    if arguments.stop is not None and not arguments.stop > 0.0:
+        raise UserError(f'--stop {arguments.stop:g}: expected a time after --start')
     need_ros()
     check_remaps(arguments.remap)
     os.environ['ROS_DOMAIN_ID'] = str(chosen_domain(False, arguments.domain))
@@ -61,7 +63,7 @@ def run(arguments: argparse.Namespace) -> int:
         'bag': str(arguments.bag),
         'rate': _rate(arguments.rate),
         'start': arguments.start,
-        'stop': arguments.stop,
+        'stop': 0.0 if arguments.stop is None else arguments.stop,
         'loop': arguments.loop,
         'paused': arguments.pause,
         'everything': arguments.all,

@@ -232,7 +232,8 @@ class SessionNode(Node):
     def _made_by(self) -> str:
         devices = {} if self.simulated else self.config.devices
         files = {name: device.file for name, device in devices.items()}
-        return provenance(self.session, self._file, files)
+        cycles = {plan.cycle: len(plan.commands) for plan in self.config.plans}
+        return provenance(self.session, self._file, files, cycles)
 
     def _wait_for_nodes(self) -> None:
         clients = {f'{name}/change_state': client for name, client in self._change.items()}

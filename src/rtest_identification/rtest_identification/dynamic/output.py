@@ -158,7 +158,7 @@ def summary(result: DynamicResult) -> str:
         for one in result.naming.effects
     )
     return f'{result.setup} {result.naming.verdict}{": " + effects if effects else ""}; ' + (
-        f'gauges {1e3 * result.offset.value:+.3f} ms'
+        f'gauges {1e3 * result.offset.value:+.3f} ± {2e3 * result.offset.stddev:.3f} ms'
         if result.offset.determined else 'time offset not determined'
     )
 

@@ -98,10 +98,17 @@ def laser_recording(
 
     sphere_radius : [m], where the recording does not say it
 
-    Raises UserError where there is nothing of a laser nest in it.
+    Raises UserError where there is nothing of a laser nest in it, or where it says otherwise.
     """
     recording = read_recording(path)
     rules = rules_of(recording)
+    if recording.nests and rules.nest is not NestKind.LASER:
+        raise UserError(f'{path}: the nest is of contact gauges, as the recording says')
+    said = rules.sphere_radius
+    if sphere_radius is not None and said > 0.0 and abs(sphere_radius / said - 1.0) > 1e-3:
+        raise UserError(
+            f'{path}: --sphere-radius-mm: the recording says {said * 1e3:g} mm; leave it out'
+        )
     if sphere_radius is not None:
         rules = replace(rules, nest=NestKind.LASER, sphere_radius=sphere_radius)
     if rules.nest is not NestKind.LASER:

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from rtest_estimation.dwell import ROTARY_LETTERS
 from rtest_estimation.errors import UserError
 from rtest_estimation.records import Cycle, CyclePlan, Kind
 from rtest_identification.thermal.poses import Poses, places
@@ -38,7 +39,7 @@ def repeated(cycles: Sequence[Cycle]) -> tuple[list[Cycle], Cycle, list[str]]:
 
     Raises UserError where none has a valid point.
     """
-    static = [c for c in cycles if c.plan.kind is Kind.STATIC]
+    static = [c for c in cycles if c.plan.kind is Kind.STATIC and _swivels(c)]
     measured = [c for c in static if c.points]
     if not measured:
         raise UserError(
@@ -70,6 +71,13 @@ def repeated(cycles: Sequence[Cycle]) -> tuple[list[Cycle], Cycle, list[str]]:
             'was moved with it'
         )
     return sorted(like, key=lambda c: (c.plan.stamp, c.plan.cycle)), model, warnings
+
+
+def _swivels(cycle: Cycle) -> bool:
+    """Whether a rotary axis of the machine moves: not where a nest is verified."""
+    plan = cycle.plan
+    columns = [k for k, axis in enumerate(plan.axes) if axis in ROTARY_LETTERS and axis != 'S']
+    return bool(np.ptp(plan.commands[:, columns], axis=0).any())
 
 
 def points_at(model: Cycle, cycle: Cycle) -> np.ndarray:
