@@ -650,7 +650,8 @@ function drawMaps() {
   const other = outer ? outer.axis : 'other axis';
   for (const name of maps) {
     const map = parts[name];
-    const how = map.levels.length ? `one line for each station of ${other}` : 'bands: U (k = 2)';
+    const how = map.levels.length ? `one line for each station of ${other}, ` +
+      'above each map its largest U (k = 2)' : 'bands: U (k = 2)';
     byId('maps').append(element('h3', '', `Axis ${map.axis}, over its own position: ${how}`));
     if (map.levels.length) byId('maps').append(levelLegend(map.levels, other));
     const open = map.symbols.filter((one) => one.lines.flat().every((value) => value === null));
@@ -661,7 +662,7 @@ function drawMaps() {
     for (const one of map.symbols.filter((other) => !open.includes(other))) {
       const figure = element('figure'), canvas = element('canvas');
       const most = Math.max(...one.U.flat().filter((value) => value !== null));
-      const spread = map.levels.length && most > 0 ? `, U (k = 2) up to ${number(most, 2)}` : '';
+      const spread = map.levels.length && most > 0 ? `, U ≤ ${number(most, 2)}` : '';
       figure.append(element('figcaption', '', `${one.symbol} [${one.unit}]${spread}`), canvas);
       byId('maps').append(figure);
       drawMap(canvas, map, one);
