@@ -294,6 +294,8 @@ def test_results_and_missing_poses_are_shown(graph, topics) -> None:
     assert page.locator('#poses button.missing').count() == 1
     assert page.locator('#poses button.done').count() == len(cycle.points)
     assert '×' in page.inner_text('#picture-factor')
+    # The session has no run-out cycle: that stands beside the numbers it concerns.
+    page.wait_for_selector("#location-card #warnings li:has-text('run-out')")
     # Something was drawn: not every pixel is transparent.
     assert page.evaluate(
         "() => { const c = document.querySelector('#picture'); "
@@ -311,6 +313,8 @@ def test_the_session_ended_from_the_page_is_closed_and_holds_the_mark(graph) -> 
             break
     assert any('not measured: 2b-nest, 2b-static' in line for line in said)
     graph.page.wait_for_selector("#link:has-text('NO CONNECTION')")
+    graph.page.wait_for_selector('body.lost')
+    assert graph.page.is_visible("#warnings li:has-text('run-out')")
     bag = read_bag(graph.folder / 'out' / 'short', ['std_msgs/msg/String'])
     assert bag.closed
     assert [mark.data for mark in bag.messages('/rtest/mark')] == ['door opened']

@@ -92,11 +92,52 @@ def test_nobody_else_can_ask(headers, status) -> None:
     assert cell.asked == []
 
 
-def test_a_foreign_name_cannot_even_look() -> None:
+@pytest.mark.parametrize('bound', ['127.0.0.1', '0.0.0.0', '192.0.2.7'])
+@pytest.mark.parametrize('named', ['evil.example', 'evil.example:8090', '[::1', 'a]b', '1.2.3'])
+def test_a_foreign_name_cannot_even_look(bound, named) -> None:
     async def test(client):
-        return (await client.get('/', headers={'Host': 'evil.example'})).status
+        return (await client.get('/', headers={'Host': named})).status
 
-    assert Cell().run(test) == 421
+    assert Cell(bound).run(test) == 421
+
+
+@pytest.mark.parametrize(
+    ('bound', 'named', 'status'),
+    [
+        ('0.0.0.0', '192.0.2.7:8090', 200),
+        ('0.0.0.0', '[2001:db8::1]:8090', 200),
+        ('0.0.0.0', socket.gethostname(), 200),
+        ('cell.example', 'Cell.Example:8090', 200),
+        ('127.0.0.1', 'localhost:8090', 200),
+        ('127.0.0.1', '[::1]:8090', 200),
+        ('127.0.0.1', '192.0.2.7', 421),
+    ],
+)
+def test_names_and_addresses_of_this_server(bound, named, status) -> None:
+    async def test(client):
+        return (await client.get('/', headers={'Host': named})).status
+
+    assert Cell(bound).run(test) == status
+
+
+@pytest.mark.parametrize(
+    ('data', 'headers', 'status'),
+    [
+        (b'{"wish": "start"}', {'Origin': 'http://['}, 403),
+        (b'{"wish": "start"}', {'Content-Type': 'text/plain; charset=klingon'}, 400),
+        (b'[' * 4000, {}, 400),
+        (b'\xff', {}, 400),
+    ],
+)
+def test_what_cannot_be_read_is_refused(data, headers, status) -> None:
+    cell = Cell()
+
+    async def test(client):
+        given = {KEY_HEADER: cell.server.key, **headers}
+        return (await client.post('/ask', data=data, headers=given)).status
+
+    assert cell.run(test) == status
+    assert cell.asked == []
 
 
 def test_elsewhere_the_page_does_not_hold_the_key_but_the_address_does() -> None:

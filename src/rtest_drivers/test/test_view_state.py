@@ -212,7 +212,9 @@ def test_the_map_fills_and_then_says_what_is_missing_and_why() -> None:
     assert shown['rows'] == ['B 0°', 'B 28.648°']
     assert len(shown['columns']) == 3
     assert shown['places'][4] == (1, 1) and shown['places'][6] == (0, 0)
-    assert shown['states'] == ['done'] * 2 + ['open'] * 5
+    # The machine was there; whether something was measured is known when the cycle has come.
+    assert shown['states'] == ['reached'] * 2 + ['open'] * 5
+    assert (shown['reached'], shown['done']) == (2, 0)
     missing = (Missing(3, ''), Missing(6, ''))
     state.add_cycle(Cycle(plan(), tuple(point(n) for n in (0, 1, 2, 4, 5)), missing, '', SECOND))
     state.add_report(Report('estimator: finished cycle', 1, '1a: 5 of 7 poses',
@@ -249,6 +251,23 @@ def test_another_session_begins_anew() -> None:
     assert state.parts['cycle:0'][1]['cycle'] == '1b'
 
 
+def test_a_page_opened_late_keeps_what_came_before_the_first_plan() -> None:
+    for plan_first in (True, False):
+        state = state_with_machine()
+        if plan_first:
+            state.add_plan(plan())
+        state.add_result('location', {'rows': []})
+        state.add_result('map:B', {'axis': 'B'})
+        state.add_mark('door opened')
+        if not plan_first:
+            state.add_plan(plan())
+        state.add_plan(plan(cycle='1b'))
+        assert state.parts['location'][1] == {'rows': []}
+        assert state.parts['map:B'][1] == {'axis': 'B'}
+        assert state.parts['marks'][1] == ['door opened']
+        assert state.parts['cycle:1'][1]['cycle'] == '1b'
+
+
 def test_nodes_of_the_session_before_are_forgotten() -> None:
     state = state_with_machine()
     state.add_plan(plan())
@@ -260,6 +279,22 @@ def test_nodes_of_the_session_before_are_forgotten() -> None:
 
 
 # ---- results ----
+
+
+def test_all_warnings_of_the_identifier_stay_with_the_results() -> None:
+    state = CellState()
+    said = {f'warning {n}': f'text {n}' for n in range(1, 12)}
+    state.add_report(Report('identifier: session', 1, '8 errors', said, 0.0))
+    revision, shown = state.parts['warnings']
+    assert shown == [f'text {n}' for n in range(1, 12)]
+    state.add_report(Report('identifier: session', 1, '8 errors', said, 1.0))
+    assert state.parts['warnings'][0] == revision
+    state.add_report(Report('session: progress', 0, 'finished', {'state': 'finished'}, 2.0))
+    state.tick(600.0)
+    assert state.parts['warnings'][1] == shown
+    # What is cured is no longer warned of.
+    state.add_report(Report('identifier: session', 0, '8 errors', {}, 3.0))
+    assert state.parts['warnings'][1] == []
 
 
 def test_location_errors_with_expanded_uncertainty() -> None:

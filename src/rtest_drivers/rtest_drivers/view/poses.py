@@ -10,7 +10,7 @@ import numpy as np
 from rtest_estimation.records import Cycle, CyclePlan, Kind
 from rtest_identification.machine import Machine
 
-OPEN, DONE, MISSING = 'open', 'done', 'missing'
+OPEN, REACHED, DONE, MISSING = 'open', 'reached', 'done', 'missing'
 KINDS = {
     Kind.STATIC: 'static cycle',
     Kind.DYNAMIC: 'dynamic cycle',
@@ -20,7 +20,7 @@ KINDS = {
 
 
 class PoseMap:
-    """One cycle. In it poses are measured in the order of the plan; reached ones count as done."""
+    """One cycle: poses are reached in the order of the plan; its end says which were measured."""
 
     def __init__(self, plan: CyclePlan, machine: Machine | None) -> None:
         self.plan = plan
@@ -68,13 +68,14 @@ class PoseMap:
             'names': names,
             'states': states,
             'reasons': {str(index): text for index, text in sorted(self._missing.items())},
+            'reached': states.count(REACHED),
             'done': states.count(DONE),
             'missing': states.count(MISSING),
         }
 
     def _state(self, index: int) -> str:
         if not self.finished:
-            return DONE if index < self._reached else OPEN
+            return REACHED if index < self._reached else OPEN
         return DONE if index in self._done else MISSING
 
 

@@ -100,7 +100,7 @@ class Server:
         if not self._is_ours(request.host):
             return _refusal(421, f'{request.host}: not the name of this server')
         origin = request.headers.get('Origin')
-        if origin is not None and urlsplit(origin).netloc != request.host:
+        if origin is not None and _netloc(origin) != request.host:
             return _refusal(403, f'asked by {origin}, not by the page of this server')
         if request.method == 'POST':
             given = request.headers.get(KEY_HEADER, '')
@@ -116,16 +116,22 @@ class Server:
     def _is_ours(self, host: str) -> bool:
         """Whether a Host header can be of a request meant for this server.
 
-        Addresses in numbers always are: to rebind, a foreign page needs a name.
+        Addresses in numbers are, on localhost those of the loopback: to rebind, a foreign page
+        needs a name.
         """
-        name = urlsplit(f'//{host}').hostname or ''
+        try:
+            name = urlsplit(f'//{host}').hostname or ''
+        except ValueError:
+            return False
         names = {'localhost', self.host.lower()}
         if not self.local:
             own = socket.gethostname().lower()
             names |= {own, f'{own}.local', own.partition('.')[0]}
-        with contextlib.suppress(ValueError):
-            return not self.local or ipaddress.ip_address(name).is_loopback
-        return name in names
+        try:
+            number = ipaddress.ip_address(name)
+        except ValueError:
+            return name in names
+        return not self.local or number.is_loopback
 
     # --- the page ---
 
@@ -221,10 +227,19 @@ def is_local(host: str) -> bool:
         return host.lower() == 'localhost'
 
 
+def _netloc(origin: str) -> str | None:
+    """Host and port of an Origin header; None where it is no address."""
+    try:
+        return urlsplit(origin).netloc
+    except ValueError:
+        return None
+
+
 async def _body(request: web.Request) -> dict[str, Any]:
     try:
         data = await request.json()
-    except ValueError:
+    except (ValueError, LookupError, RecursionError):
+        # No JSON, in a character set that does not exist, or nested without end.
         data = None
     return data if isinstance(data, dict) else {}
 

@@ -7,8 +7,8 @@ only when it has changed.
 
 from __future__ import annotations
 
+import itertools
 import math
-import time
 from collections import deque
 from typing import Any
 
@@ -41,6 +41,7 @@ _NODES = ('estimator', 'identifier', 'recorder', 'session')
 _SESSION, _PROGRESS, _FINISHED = (
     'session: progress', 'estimator: cycle', 'estimator: finished cycle'
 )
+_IDENTIFIED = 'identifier: session'
 _LEVELS = (OK, WARN, ERROR, ERROR)
 # When a session begins, who has spoken in this time belongs to it [s].
 _RECENT_S = 5.0
@@ -65,7 +66,7 @@ class CellState:
         self._maps: list[PoseMap] = []
         self._reasons: dict[str, dict[int, str]] = {}
         self._session = ''
-        self._marks: list[dict[str, str]] = []
+        self._marks: list[str] = []
 
     # --- what comes in ---
 
@@ -99,9 +100,13 @@ class CellState:
             self._machine = None
 
     def add_plan(self, plan: CyclePlan) -> None:
-        """A cycle begins; another session's plan begins everything anew."""
-        if plan.session != self._session:
-            self._session = plan.session
+        """A cycle begins; another session's plan begins everything anew.
+
+        The first plan that is heard clears nothing: latched topics come in any order, results
+        of the same session may be here already.
+        """
+        before, self._session = self._session, plan.session
+        if before and before != plan.session:
             self._maps.clear()
             self._reasons.clear()
             self._marks.clear()
@@ -135,10 +140,15 @@ class CellState:
             self._reach(report)
         elif report.name == _FINISHED:
             self._explain(report)
+        elif report.name == _IDENTIFIED:
+            self._warn(report)
 
     def add_mark(self, text: str) -> None:
-        """A mark that was set in the recording, by this page or by somebody else."""
-        self._marks.append({'time': time.strftime('%H:%M:%S'), 'text': text})
+        """A mark that was set in the recording, by this page or by somebody else.
+
+        The message has no time, and a page that was opened later hears it later than it was set.
+        """
+        self._marks.append(text)
         self._put('marks', self._marks[-20:])
 
     def add_result(self, name: str, shown: Any) -> None:
@@ -206,6 +216,15 @@ class CellState:
             self._show_map(attempts[-1])
         else:
             self._reasons[cycle] = reasons
+
+    def _warn(self, report: Report) -> None:
+        """What the identifier warns of, in its order; stays when it falls silent."""
+        numbers = itertools.takewhile(
+            lambda key: key in report.values, (f'warning {n}' for n in itertools.count(1))
+        )
+        warnings = [report.values[key] for key in numbers]
+        if warnings != self.parts.get('warnings', (0, []))[1]:
+            self._put('warnings', warnings)
 
     # --- the record of a moment ---
 

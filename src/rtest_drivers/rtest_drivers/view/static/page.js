@@ -10,6 +10,9 @@ const COLOURS = ['#0072B2', '#D55E00', '#007a5a', '#a0457f', '#7a6200', '#56B4E9
 const HISTORY_S = 60;
 // Values are old when nothing came for this long [ms].
 const LOST_MS = 1500;
+const POSE_WORDS = {open: 'to come', reached: 'reached', done: 'measured', missing: 'missing'};
+// So that no line of a map is told by its colour alone.
+const DASHES = [['solid', []], ['dashed', [7, 4]], ['dotted', [2, 3]]];
 
 let live = null, heard = 0, drawn = true;
 let strip = [];
@@ -65,6 +68,7 @@ function connect() {
 
 function watch() {
   const old = performance.now() - heard;
+  document.body.classList.toggle('lost', Boolean(heard) && old > LOST_MS);
   if (!heard) set(byId('link'), 'CONNECTING', 'badge idle');
   else if (old > LOST_MS) {
     set(byId('link'), `NO CONNECTION for ${(old / 1000).toFixed(0)} s: all values are old`,
@@ -214,8 +218,7 @@ function drawRecording() {
   }
   if (one.file) lines.push(['file', one.file.split('/').pop()]);
   if (parts.marks && parts.marks.length) {
-    const last = parts.marks[parts.marks.length - 1];
-    lines.push(['last mark', `${last.time} ${last.text}`]);
+    lines.push(['last mark', parts.marks[parts.marks.length - 1]]);
   }
   const made = rows(byId('recording'), 2 * lines.length,
     (index) => element(index % 2 ? 'dd' : 'dt'));
@@ -272,7 +275,9 @@ function frame(context, box, low, high, unit) {
   context.fillStyle = '#56616c';
   context.textAlign = 'right';
   context.textBaseline = 'middle';
-  for (const value of steps(low, high, 4)) {
+  // One number alone is no scale.
+  const few = steps(low, high, 4);
+  for (const value of few.length > 1 ? few : steps(low, high, 8)) {
     context.strokeStyle = value === 0 ? '#8a949e' : '#dde2e7';
     context.beginPath();
     context.moveTo(box.left, at(value));
@@ -389,10 +394,10 @@ function drawPoses() {
     };
   });
   const one = parts[current], grid = byId('poses');
-  const open = one.states.length - one.done - one.missing;
-  set(byId('poses-title'), `${one.kind}, sphere ${one.setup}: ${one.done} of ` +
-    `${one.states.length} measured` + (one.missing ? `, ${one.missing} MISSING` : '') +
-    (open && one.finished === false ? `, ${open} to come` : ''));
+  const all = one.states.length;
+  set(byId('poses-title'), `${one.kind}, sphere ${one.setup}: ` + (one.finished ?
+    `${one.done} of ${all} measured` + (one.missing ? `, ${one.missing} MISSING` : '') :
+    `${one.reached} of ${all} reached, measured or not is known at its end`));
   drawGrid(grid, one, current);
   const reasons = Object.entries(one.reasons).filter(([index]) => one.states[index] === 'missing');
   const list = rows(byId('missing'), reasons.length, () => element('li'));
@@ -443,14 +448,13 @@ function drawGrid(grid, one, name) {
   }
   for (const button of grid.querySelectorAll('button')) {
     const state = one.states[button.dataset.pose];
-    set(button, {open: '·', done: '✓', missing: '✗'}[state], state);
-    const words = {open: 'to come', done: 'measured', missing: 'missing'};
-    button.setAttribute('aria-label', `${one.names[button.dataset.pose]}: ${words[state]}`);
+    set(button, {open: '·', reached: '○', done: '✓', missing: '✗'}[state], state);
+    button.setAttribute('aria-label', `${one.names[button.dataset.pose]}: ${POSE_WORDS[state]}`);
   }
 }
 
 function showPose(one, index) {
-  const state = {open: 'to come', done: 'measured', missing: 'missing'}[one.states[index]];
+  const state = POSE_WORDS[one.states[index]];
   const why = one.reasons[index] ? `: ${one.reasons[index]}` : '';
   set(byId('pose-name'), `Pose ${index}, ${one.names[index]}: ${state}${why}`);
 }
@@ -459,7 +463,7 @@ function showPose(one, index) {
 
 function showPart(name) {
   if (name.startsWith('cycle:')) drawPoses();
-  else if (name === 'location' || name === 'gap') drawLocation();
+  else if (['location', 'warnings', 'gap'].includes(name)) drawLocation();
   else if (name === 'picture') drawPicture();
   else if (name.startsWith('map:')) drawMaps();
 }
@@ -481,6 +485,14 @@ function drawLocation() {
     set(spread, `± ${number(one.U, 2)}`);
     set(unit, one.unit);
   });
+  const warnings = parts.warnings || [];
+  const list = rows(byId('warnings'), warnings.length, () => element('li'));
+  warnings.forEach((text, index) => set(list[index], text));
+  byId('warnings').hidden = !warnings.length;
+  drawGap();
+}
+
+function drawGap() {
   const gap = parts.gap, box = byId('gap');
   box.replaceChildren();
   if (!gap) {
@@ -634,11 +646,14 @@ function drawMaps() {
   const maps = Object.keys(parts).filter((name) => name.startsWith('map:')).sort();
   byId('maps-card').hidden = !maps.length;
   byId('maps').replaceChildren();
+  const outer = maps.map((name) => parts[name]).find((map) => !map.levels.length);
+  const other = outer ? outer.axis : 'other axis';
   for (const name of maps) {
     const map = parts[name];
-    const over = map.levels.length ? `over ${map.axis}, one line for each station of the other ` +
-      'rotary axis' : `over ${map.axis}`;
-    byId('maps').append(element('h3', '', `Axis ${map.axis}: ${over}`));
+    const how = map.levels.length ? `one line for each station of ${other}, ` +
+      'above each map its largest U (k = 2)' : 'bands: U (k = 2)';
+    byId('maps').append(element('h3', '', `Axis ${map.axis}, over its own position: ${how}`));
+    if (map.levels.length) byId('maps').append(levelLegend(map.levels, other));
     const open = map.symbols.filter((one) => one.lines.flat().every((value) => value === null));
     if (open.length) {
       byId('maps').append(element('p', 'quiet', 'Not determined by these poses: ' +
@@ -646,11 +661,29 @@ function drawMaps() {
     }
     for (const one of map.symbols.filter((other) => !open.includes(other))) {
       const figure = element('figure'), canvas = element('canvas');
-      figure.append(element('figcaption', '', `${one.symbol} [${one.unit}]`), canvas);
+      const most = Math.max(...one.U.flat().filter((value) => value !== null));
+      const spread = map.levels.length && most > 0 ? `, U ≤ ${number(most, 2)}` : '';
+      figure.append(element('figcaption', '', `${one.symbol} [${one.unit}]${spread}`), canvas);
       byId('maps').append(figure);
       drawMap(canvas, map, one);
     }
   }
+}
+
+function levelColour(n, count) {
+  return `hsl(${210 + 150 * n / count}, 70%, 38%)`;
+}
+
+function levelLegend(levels, axis) {
+  const made = element('p', 'legend');
+  levels.forEach((level, n) => {
+    const one = element('span'), line = element('i');
+    line.style.borderColor = levelColour(n, levels.length);
+    line.style.borderTopStyle = DASHES[n % DASHES.length][0];
+    one.append(line, element('span', '', `${axis} ${String(level).replace('-', '−')}°`));
+    made.append(one);
+  });
+  return made;
 }
 
 function drawMap(canvas, map, one) {
@@ -671,8 +704,8 @@ function drawMap(canvas, map, one) {
     context.fillText(`${number(value, 0)}°`, x(value), box.bottom + 4);
   }
   one.lines.forEach((line, n) => {
-    const colour = map.levels.length ? `hsl(${210 + 150 * n / one.lines.length}, 70%, 38%)` :
-      COLOURS[0];
+    const colour = map.levels.length ? levelColour(n, one.lines.length) : COLOURS[0];
+    context.setLineDash(map.levels.length ? DASHES[n % DASHES.length][1] : []);
     if (!map.levels.length) {
       context.fillStyle = 'rgba(0, 114, 178, .18)';
       context.beginPath();
