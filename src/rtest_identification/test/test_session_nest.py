@@ -28,7 +28,8 @@ LASER = {
     'machine': 'machine.yaml',
     'sphere_radius_mm': 25,
     'nest': {'kind': 'laser', 'directions': [{'azimuth_deg': 30, 'tilt_deg': 45},
-                                             {'azimuth_deg': 150, 'tilt_deg': 45}]},
+                                             {'azimuth_deg': 150, 'tilt_deg': 45},
+                                             {'azimuth_deg': 270, 'tilt_deg': 45}]},
     'nest_calibration': {'edge_mm': 0.8},
     'verification': {'dwell_s': 0.2},
     'scan': {'half_mm': 1.0, 'pitch_mm': 0.25, 'feed_mm_min': 90},
@@ -49,7 +50,8 @@ def test_what_is_measured_in_which_order(tmp_path):
     assert config.nest is NestKind.LASER
     assert [(plan.cycle, plan.kind) for plan in config.plans] == [
         ('1a-nest', Kind.NEST_CALIBRATION), ('1a-verification', Kind.STATIC),
-        ('1a-scan-1', Kind.DYNAMIC), ('1a-scan-2', Kind.DYNAMIC), ('1a-static', Kind.STATIC),
+        ('1a-scan-1', Kind.DYNAMIC), ('1a-scan-2', Kind.DYNAMIC), ('1a-scan-3', Kind.DYNAMIC),
+        ('1a-static', Kind.STATIC),
         ('1b-nest', Kind.NEST_CALIBRATION), ('1b-static', Kind.STATIC),
     ]
     plain = load(tmp_path, verification=None, scan=None)
@@ -60,7 +62,7 @@ def test_what_is_measured_in_which_order(tmp_path):
 
 def test_the_sphere_goes_through_the_cubes(tmp_path):
     config = load(tmp_path)
-    for plan, edge, count in ((config.plans[0], 0.8e-3, 27), (config.plans[1], 1e-3, 1183)):
+    for plan, edge, count in ((config.plans[0], 0.8e-3, 27), (config.plans[1], 0.8e-3, 1183)):
         off = predict(config.machine, plan.commands).centre - SPHERE
         np.testing.assert_allclose(off[[0, -1]], 0.0, atol=1e-12)
         assert len(np.unique(np.round(off, 9), axis=0)) == count == len(off) - 2
@@ -88,7 +90,7 @@ def test_a_scan_goes_in_lines_across_its_beam(tmp_path):
 
 def test_a_scan_takes_the_time_of_its_feed(tmp_path):
     config = load(tmp_path)
-    scan, static = config.plans[2], config.plans[4]
+    scan, static = config.plans[2], config.plans[5]
     path = synchronous_path(config.machine, scan)
     line = np.flatnonzero(path.pose == 2)[0]
     assert path.time[line] == pytest.approx(2.0 / 1.5)
@@ -99,7 +101,7 @@ def test_a_scan_takes_the_time_of_its_feed(tmp_path):
 
 def test_a_verification_says_nothing_of_rotary_axes(tmp_path):
     config = load(tmp_path)
-    verification, static = config.plans[1], config.plans[4]
+    verification, static = config.plans[1], config.plans[5]
     assert turns(config.machine, static) and not turns(config.machine, verification)
 
     def measured(plan):
@@ -123,8 +125,11 @@ def test_a_verification_says_nothing_of_rotary_axes(tmp_path):
         ({'nest': {'kind': 'contact'}}, 'verification: is of laser nests'),
         ({'sphere_radius_mm': None}, 'sphere_radius_mm: missing'),
         ({'nest': {'kind': 'laser'}}, 'nest: directions: expected a list'),
-        ({'nest': {'kind': 'laser', 'directions': [{'azimuth_deg': 3}]}},
+        ({'nest': {'kind': 'laser', 'directions': [{'azimuth_deg': k} for k in range(3)]}},
          'directions: 1: tilt_deg: missing'),
+        ({'nest': {'kind': 'laser', 'directions': [{'azimuth_deg': k} for k in range(2)]}},
+         'expected three or four, got 2'),
+        ({'verification': {'edge_mm': 2}}, 'is beyond the calibrated cube of 0.8 mm'),
         ({'nest_calibration': {'step_mm': 1.0}}, "nest_calibration: unknown key 'step_mm'"),
         ({'scan': {'pitch_mm': 0.0}}, 'scan: pitch_mm: expected 0.01 to 1'),
         ({'verification': 1183}, 'verification: expected a mapping'),
