@@ -11,6 +11,7 @@ from rtest_estimation.errors import UserError
 
 # Time for the graph to be found, and for an answer [s].
 _FIND_S, _ANSWER_S = 5.0, 5.0
+_SETTLE_S = 0.5
 
 
 def ask_session(wish: str, domain: int, namespace: str = '') -> str:
@@ -33,6 +34,8 @@ def ask_session(wish: str, domain: int, namespace: str = '') -> str:
                 f'no session in ROS domain {domain}{where}; --domain is what the session was '
                 'started with'
             )
+        # A service is seen a little before its answers find their way back.
+        executor.spin_once(_SETTLE_S)
         future = client.call_async(Trigger.Request())
         executor.spin_until_future_complete(future, _ANSWER_S)
         if not future.done():

@@ -72,6 +72,13 @@ LISTENERS = ('recorder', 'estimator')
 STREAMS = ('rtest/gauges', 'rtest/cnc/feedback')
 # Wall time a service may take [s]: an identification of a long session is the longest.
 SERVICE_TIMEOUT_S = 120.0
+# After this time an answer is taken for lost [s].
+ANSWER_S = 5.0
+_REACHED = {
+    Transition.TRANSITION_CONFIGURE: State.PRIMARY_STATE_INACTIVE,
+    Transition.TRANSITION_ACTIVATE: State.PRIMARY_STATE_ACTIVE,
+    Transition.TRANSITION_DEACTIVATE: State.PRIMARY_STATE_INACTIVE,
+}
 # A subscription is seen in the graph a little before its publisher has matched it [s].
 SETTLE_S = 0.5
 # All nodes of a busy graph are found after this time [s].
@@ -286,7 +293,7 @@ class SessionNode(Node):
         }
         self._status = f'preparing {driver}'
         while True:
-            answer = self._call(self._state[driver], GetState.Request(), f'{driver}/get_state')
+            answer = self._ask_state(driver)
             state = answer.current_state.id
             # Somebody else may have activated the driver already; that is as good.
             if state == goal or state == State.PRIMARY_STATE_ACTIVE:
@@ -299,9 +306,32 @@ class SessionNode(Node):
                 why = self._said.get(driver, '') or 'its log says why'
                 raise SessionError(f'driver {driver} could not be {word}: {why}')
 
+    def _ask_state(self, driver: str) -> GetState.Response:
+        """The state of a driver; asked again where the answer was lost.
+
+        A service is seen a little before its answers find their way back.
+        """
+        client, deadline = self._state[driver], time.monotonic() + SERVICE_TIMEOUT_S
+        while time.monotonic() < deadline:
+            future = client.call_async(GetState.Request())
+            if self.wait(future.done, ANSWER_S):
+                return future.result()
+            client.remove_pending_request(future)
+        raise SessionError(f'{driver}/get_state did not answer within {SERVICE_TIMEOUT_S:.0f} s')
+
     def _transition(self, driver: str, transition: int) -> bool:
+        """Change the state of a driver; where the answer is lost its state tells."""
         request = ChangeState.Request(transition=Transition(id=transition))
-        return self._call(self._change[driver], request, f'{driver}/change_state').success
+        future = self._change[driver].call_async(request)
+        deadline = time.monotonic() + SERVICE_TIMEOUT_S
+        while not self.wait(future.done, ANSWER_S):
+            if self._ask_state(driver).current_state.id == _REACHED[transition]:
+                return True
+            if time.monotonic() > deadline:
+                raise SessionError(
+                    f'{driver}/change_state did not answer within {SERVICE_TIMEOUT_S:.0f} s'
+                )
+        return future.result().success
 
     def _may_start(self, plan: CyclePlan) -> bool:
         """Wait until the cycle is asked for, where the session holds; whether it is."""
