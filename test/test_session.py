@@ -280,9 +280,11 @@ def test_a_cycle_without_a_point_makes_the_session_incomplete(start, tmp_path):
     session = start('--simulate', truth)
     status, out, err = session.end()
     assert status == 1 and 'Traceback' not in err
-    assert '1a-static: 0 of 14 poses, 14 missing (0-13: no gauge readings)' in out
+    # A gauge that is silent for a cycle reads again at its end, which may be one reading of the
+    # last dwell: too few, another reason.
+    assert re.search(r'1a-static: 0 of 14 poses, 14 missing \(0-1[23]: no gauge readings', out)
     assert 'incomplete: nothing was measured in 1a-static' in out
-    assert '1a-static 0-13: no gauge readings' in err, 'why it could not be identified'
+    assert re.search(r'1a-static 0-1[23]: no gauge readings', err), 'why it was not identified'
     recording = read_recording(session.out / 'short')
     assert recording.closed and len(recording.cycles) == 2
 
