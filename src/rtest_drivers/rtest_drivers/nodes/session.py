@@ -558,8 +558,12 @@ class SessionNode(Node):
             self._problem(f'incomplete: nothing was measured in {", ".join(lost)}')
 
     def _close(self) -> None:
-        for name in self._drivers:
-            if not self._transition(name, Transition.TRANSITION_DEACTIVATE):
+        # All at once: a dwell that has no end is taken to be at the end of the feedback, and needs
+        # readings there; and feedback that ends before the readings is stale.
+        request = ChangeState.Request(transition=Transition(id=Transition.TRANSITION_DEACTIVATE))
+        asked = {name: self._change[name].call_async(request) for name in reversed(self._drivers)}
+        for name, future in asked.items():
+            if not self.wait(future.done, SERVICE_TIMEOUT_S) or not future.result().success:
                 self._problem(f'driver {name} could not be deactivated')
         for name in self._finishers:
             # Let the last messages of the one before arrive.
