@@ -37,6 +37,9 @@ _NEAR_NS = 5_000_000_000
 # A dynamic cycle rests so long wherever it turns round; half the time over which speeds are
 # differences [ns].
 _REST, _HALF_SPAN = 1_000_000_000, 1_000_000
+# What goes wrong in a whole cycle does so until its last pose is over also by the encoders, which
+# are read a little after the axes have stopped; no next pose is as near [ns].
+_LINGER_NS = 100_000_000
 # From and to [ns].
 Wait = tuple[int, int] | None
 
@@ -203,8 +206,9 @@ class Cell:
             poses[pose] = (clock, clock + dwell)
             clock += dwell
         self._run = Run(plan, start, clock)
+        whole = start, clock + _LINGER_NS
         self._windows += [
-            window(fault, *(poses[fault.pose] if fault.pose is not None else (start, clock)))
+            window(fault, *(poses[fault.pose] if fault.pose is not None else whole))
             for fault in self.truth.faults
             if fault.cycle == plan.cycle and (fault.pose is None or fault.pose in poses)
         ]
