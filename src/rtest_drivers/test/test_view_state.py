@@ -297,6 +297,14 @@ def test_all_warnings_of_the_identifier_stay_with_the_results() -> None:
     assert state.parts['warnings'][1] == []
 
 
+def test_what_is_said_of_the_verdict_on_the_model_stays_with_it() -> None:
+    state = CellState()
+    notes = {'note 1': 'unexplained at B = -40.0 deg: rms 2.10 µm', 'note 2': 'C = 0'}
+    state.add_report(Report('identifier: model gap', 1, 'unknown effect', notes, 0.0))
+    assert state.parts['gap_notes'][1] == list(notes.values())
+    assert state.tick(0.5)['devices'][3]['text'] == 'unknown effect'
+
+
 def test_location_errors_with_expanded_uncertainty() -> None:
     found = results.location_table(
         ['E_X(0Y)B', 'E_A(0Y)B'], [-7.8e-6, 18e-6], [1e-14, 0.0, 0.0, 4e-12], 2.5e-7

@@ -1,9 +1,9 @@
 """Whether a measuring chain is fit to measure: judged from a short recorded session.
 
-The session is a nest calibration, a run-out and a cycle of ten visits to one pose (session file
-with `kind: check`); before, between or after them the sphere stands still in the nest for half a
-minute. Each finding has a value, a limit, a verdict and what to do. The limits are those at which
-an R-test with a noise of some tenths of a micrometre begins to suffer, not those of a standard.
+The session is a nest calibration, a run-out, a cycle of ten visits to one pose and one in which
+the sphere stands still in the nest (session file with `kind: check`). Each finding has a value, a
+limit, a verdict and what to do. The limits are those at which an R-test with a noise of some
+tenths of a micrometre begins to suffer, not those of a standard.
 """
 
 from __future__ import annotations
@@ -184,7 +184,7 @@ def noise(standing: Standing | None, spindle_hz: float | None = None) -> list[Fi
         seconds = 0.0 if standing is None else standing.duration
         return [Finding(
             'noise', f'{seconds:.1f} s without motion', f'at least {_STANDING_S:g} s', OPEN,
-            'let the sphere stand in the nest for half a minute (rtest session --hold)',
+            'measure a session of `kind: check`, in which the sphere stands still',
         )]
     found = []
     for index, spread in enumerate(standing.noise):

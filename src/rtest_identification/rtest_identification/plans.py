@@ -19,6 +19,9 @@ from rtest_identification.machine import Machine
 SPINDLE = 'S'
 # To the first pose of a check.
 VISITS = 10
+# How long the sphere stands still for the noise of the gauges [s], at each of three places so far
+# apart [m]: enough to tell 50 from 60 Hz and both from a spindle.
+STANDING_S, _STANDING_STEP = 15.0, 1e-4
 # Twelve uneven stations of a full turn. Even ones show harmonic n and 12 - n as one and the same;
 # of these the sum of exp(i n C) is at most 0.33 of the number of stations for every n up to 22, so
 # that no harmonic up to 11 looks like another (cosine at most 0.83 beside location errors), and
@@ -217,6 +220,15 @@ def check(
     poses = [zero, *(pose for one in away for pose in (one, zero))]
     commands = linear_positions(machine, sphere, _rotary(machine, poses))
     return _plan(machine, Kind.STATIC, setup, 'check', sphere, commands, dwell)
+
+
+def standing(machine: Machine, setup: str, sphere: np.ndarray) -> CyclePlan:
+    """The sphere stands still in the nest, for the noise of the gauges.
+
+    A static cycle in which no rotary axis moves: `observations.stack` leaves it out.
+    """
+    commands = _stepped(machine, sphere, np.array([[0.0, 0.0, _STANDING_STEP]]))
+    return _plan(machine, Kind.STATIC, setup, 'standing', sphere, commands, STANDING_S)
 
 
 def dynamic(

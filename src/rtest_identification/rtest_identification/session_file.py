@@ -25,6 +25,7 @@ from rtest_identification.plans import (
     dynamic,
     program_name,
     spindle_runout,
+    standing,
     static,
     thermal,
 )
@@ -172,6 +173,7 @@ def load_session(path: Path | str, kind: str | None = None) -> SessionConfig:
         if kind in _BUILD:
             cycle = _BUILD[kind](machine, name, sphere, *stations, dwell)
             plans += thermal(cycle, repetitions) if kind == THERMAL else [cycle]
+            plans += [standing(machine, name, sphere)] if kind == CHECK else []
         try:
             plans += [dynamic(machine, name, sphere, *each) for each in turning]
         except UserError as error:

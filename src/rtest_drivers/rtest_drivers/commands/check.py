@@ -1,16 +1,18 @@
 """Judge a measuring chain by a short recorded session, before the first real one.
 
-BAG is a session whose file has `cycle: {kind: check, ...}`: nest calibration, sphere run-out and
-ten visits to one pose, with half a minute of standing still (rtest session --hold). Prints of each
-gauge its direction, sign, gain, noise and strongest line, of the nest its residual and geometry,
-run-out, repeatability and temperature: value, limit, verdict, and what to do. Exit status 1 where
-something is wrong. `rtest session --check` tries the devices before.
+BAG is a session whose file has `cycle: {kind: check, ...}`: nest calibration, sphere run-out, ten
+visits to one pose, and the sphere standing still. Prints of each gauge its direction, sign, gain,
+noise and strongest line, of the nest its residual and geometry, run-out, repeatability and
+temperature: value, limit, verdict, and what to do. Exit status 1 where something is wrong.
+`rtest session --check` tries the devices, measures such a session and judges it.
 """
 
 from __future__ import annotations
 
 import argparse
+import math
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 from rtest_estimation.errors import UserError
@@ -30,6 +32,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Judge and print; returns the exit status."""
+    return judge(arguments.bag, arguments.direction, arguments.spindle_rpm)
+
+
+def judge(path: Path, direction: Sequence[float], rpm: float | None = None) -> int:
+    """Judge the recorded session of a measuring chain, print; 1 where something is wrong, else 0.
+
+    direction : (3,) from the nest to where the sphere comes from, frame ``table``
+    rpm : of the spindle while nothing else moved [1/min]
+    """
     import numpy as np
 
     from rtest_estimation.bagfile import read_bag
@@ -38,13 +49,14 @@ def run(arguments: argparse.Namespace) -> int:
     from rtest_identification import chain_check
     from rtest_identification.offline import estimate_recording
 
-    towards = np.array(arguments.direction)
+    towards = np.array(direction)
     length = float(np.linalg.norm(towards))
-    if not length > 0.0:
+    if not 0.0 < length < math.inf:
         raise UserError('--direction: expected a vector that is not zero')
-    bag = read_bag(arguments.bag, TYPES)
+    if rpm is not None and not 0.0 < rpm < math.inf:
+        raise UserError(f'--spindle-rpm: expected a positive number, got {rpm:g}')
+    bag = read_bag(path, TYPES)
     recording = recording_of(bag)
-    rpm = arguments.spindle_rpm
     found = chain_check.check_chain(
         estimate_recording(recording),
         longest_standing(recording.gauges, recording.feedback),
@@ -64,5 +76,5 @@ def run(arguments: argparse.Namespace) -> int:
     unknown = sum(one.verdict == chain_check.OPEN for one in found)
     for what in wrong:
         print(f'rtest: wrong: {what}', file=sys.stderr)
-    print(f'{arguments.bag}: {len(found)} looked at, {len(wrong)} wrong, {unknown} left open')
+    print(f'{path}: {len(found)} looked at, {len(wrong)} wrong, {unknown} left open')
     return 1 if wrong else 0

@@ -1,8 +1,9 @@
 """Run a session: start the node graph, measure every cycle of the session file, record.
 
-The session file says under `devices` where gauges and CNC are to be reached; --check tries them.
-A driver it does not name is expected in the ROS graph of this machine. With --simulate a simulated
-machine cell takes their place, on this host only.
+The session file says under `devices` where gauges and CNC are to be reached; --check tries them,
+and measures and judges the whole chain where the file has a cycle of `kind: check`. A driver it
+does not name is expected in the ROS graph of this machine. With --simulate a simulated machine
+cell takes their place, on this host only.
 """
 
 from __future__ import annotations
@@ -34,6 +35,8 @@ if TYPE_CHECKING:
     from rtest_estimation.records import CyclePlan
 
 HELP = 'run a measurement session and record it'
+# What --check tries: the devices alone, or all that is between the sphere and the report.
+DEVICES, CHAIN = 'devices', 'chain'
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -44,9 +47,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         help='name of the session (default: name of the file, date, time)')
     parser.add_argument('--simulate', type=Path, metavar='TRUTH.yaml',
                         help='measure a simulated cell with the errors of this file')
-    parser.add_argument('--check', action='store_true',
-                        help='measure nothing: try every device of the session file and print '
-                        'what answers, rate, jitter, skew, unit, range; status 1 where one fails')
+    parser.add_argument('--check', nargs='?', choices=(DEVICES, CHAIN), const=CHAIN,
+                        help='try every device of the session file and print what answers, rate, '
+                        'jitter, skew, unit, range; then, where its cycle is of kind: check, '
+                        'measure it and judge the whole chain as `rtest check` does. '
+                        '`--check devices` measures nothing. Status 1 where something is wrong')
     parser.add_argument('--moves', action='store_true',
                         help='with --check: MOVES each axis of a LinuxCNC by 1 mm or 1 deg and '
                         'back, and says which sign, unit or name is wrong')
@@ -82,8 +87,10 @@ def run(arguments: argparse.Namespace) -> int:
     config = (arguments.config or config_path('demo.yaml')).absolute()
     if arguments.moves and not arguments.check:
         raise UserError('--moves: expected together with --check')
-    if arguments.check:
-        return _check(config, arguments.moves, arguments.simulate)
+    if arguments.check and not _check(config, arguments):
+        return 1
+    if arguments.check and not _is_chain(config, arguments.check):
+        return 0
     settings = GraphSettings(
         config=config,
         session=arguments.session or session_name(config.stem),
@@ -99,27 +106,68 @@ def run(arguments: argparse.Namespace) -> int:
         view_node(*settings.view)
         check_address(*settings.view)
     settings, complete = measure(settings, arguments.domain, bool(arguments.session))
+    if arguments.check:
+        return _judge(settings, complete)
     evaluate(settings, complete)
     return 0
 
 
-def _check(path: Path, moves: bool, simulate: Path | None) -> int:
-    """Try the devices of a session file; returns the exit status."""
+def _is_chain(path: Path, check: str) -> bool:
+    """Whether the whole chain is to be checked: the file has the cycles for it."""
+    from rtest_identification.session_file import CHECK, load_session
+
+    return check == CHAIN and load_session(path).kind == CHECK
+
+
+def _check(path: Path, arguments: argparse.Namespace) -> bool:
+    """Try the devices of a session file; whether all are right.
+
+    A simulated cell has none, nor need a file that checks the whole chain name any.
+    """
     from rtest_drivers.device_check import check_session_devices
     from rtest_drivers.devices import check_devices
     from rtest_identification.session_file import load_session
 
     config = load_session(path)
-    if simulate is not None:
-        raise UserError('--check: a simulated cell has no devices to try; leave --simulate out')
-    if not config.devices:
+    chain = _is_chain(path, arguments.check)
+    example = 'config/check_example.yaml'
+    if arguments.simulate is not None:
+        if not chain:
+            raise UserError(
+                '--check: a simulated cell has no devices to try; leave --simulate out, or give a '
+                f'session file with cycle: {{kind: check}}, as {example}, to check the whole chain'
+            )
+        return True
+    if not config.devices and not chain:
         raise UserError(f'{path}: devices: missing, --check tries what it names')
     check_devices(config, path)
-    wrong = check_session_devices(config, moves)
+    wrong = check_session_devices(config, arguments.moves)
     for line in wrong:
         print(f'rtest: {line}', file=sys.stderr)
-    print(f'{shown(path)}: ' + (f'{len(wrong)} found wrong' if wrong else 'every device answers'))
-    return 1 if wrong else 0
+    if config.devices:
+        print(f'{shown(path)}: '
+              + (f'{len(wrong)} found wrong' if wrong else 'every device answers'))
+    if not wrong and not chain and arguments.check == CHAIN:
+        print('the whole chain, with nest, sphere and noise, is checked with a session file of '
+              f'cycle: {{kind: check}}, as {example}')
+    return not wrong
+
+
+def _judge(settings: GraphSettings, complete: bool) -> int:
+    """Judge the chain by what was recorded; returns the exit status."""
+    from rtest_drivers.commands.check import judge
+    from rtest_identification.session_file import load_session
+
+    try:
+        wrong = judge(settings.folder, load_session(settings.config).approach.direction)
+    except UserError as error:
+        raise NodeFailed(f'{error}\n  recorded: {shown(settings.recording)}') from None
+    if not complete:
+        raise NodeFailed(
+            f'session {settings.session} is incomplete, see above; the verdicts are of what there '
+            f'is; to judge it again: rtest check {shlex.quote(shown(settings.folder))}'
+        )
+    return wrong
 
 
 def measure(

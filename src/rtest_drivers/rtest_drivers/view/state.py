@@ -41,7 +41,11 @@ _NODES = ('estimator', 'identifier', 'recorder', 'session')
 _SESSION, _PROGRESS, _FINISHED = (
     'session: progress', 'estimator: cycle', 'estimator: finished cycle'
 )
-_IDENTIFIED = 'identifier: session'
+# Lines of the identifier: of the status, what they are numbered as, as which part they are shown.
+_TOLD = {
+    'identifier: session': ('warning', 'warnings'),
+    'identifier: model gap': ('note', 'gap_notes'),
+}
 _LEVELS = (OK, WARN, ERROR, ERROR)
 # When a session begins, who has spoken in this time belongs to it [s].
 _RECENT_S = 5.0
@@ -140,8 +144,8 @@ class CellState:
             self._reach(report)
         elif report.name == _FINISHED:
             self._explain(report)
-        elif report.name == _IDENTIFIED:
-            self._warn(report)
+        elif report.name in _TOLD:
+            self._tell(report, *_TOLD[report.name])
 
     def add_mark(self, text: str) -> None:
         """A mark that was set in the recording, by this page or by somebody else.
@@ -217,14 +221,14 @@ class CellState:
         else:
             self._reasons[cycle] = reasons
 
-    def _warn(self, report: Report) -> None:
-        """What the identifier warns of, in its order; stays when it falls silent."""
+    def _tell(self, report: Report, word: str, part: str) -> None:
+        """What the identifier says beside its results, in its order; stays when it is silent."""
         numbers = itertools.takewhile(
-            lambda key: key in report.values, (f'warning {n}' for n in itertools.count(1))
+            lambda key: key in report.values, (f'{word} {n}' for n in itertools.count(1))
         )
-        warnings = [report.values[key] for key in numbers]
-        if warnings != self.parts.get('warnings', (0, []))[1]:
-            self._put('warnings', warnings)
+        told = [report.values[key] for key in numbers]
+        if told != self.parts.get(part, (0, []))[1]:
+            self._put(part, told)
 
     # --- the record of a moment ---
 

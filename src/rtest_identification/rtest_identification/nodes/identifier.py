@@ -20,12 +20,16 @@ from rtest_estimation.records import Kind
 from rtest_estimation.records import NestCalibration as NestRecord
 from rtest_identification.gap.model_file import load_model
 from rtest_identification.gap.offline import gap_session
-from rtest_identification.gap.output import summary
+from rtest_identification.gap.output import lines, summary
+from rtest_identification.gap.workflow import GapResult
 from rtest_identification.machine import Machine, parse_machine
 from rtest_identification.nodes import publish
 from rtest_identification.nodes.markers import position_markers
 from rtest_identification.observations import turns
 from rtest_identification.pipeline import Identification, identify
+
+# Verdicts on the model gap that leave nothing to be looked for.
+_GOOD = ('no gap', 'explained')
 
 
 class IdentifierNode(Node):
@@ -54,6 +58,7 @@ class IdentifierNode(Node):
     def _begin(self) -> None:
         self._cycles: list[CycleRecord] = []
         self._result: Identification | None = None
+        self._found: GapResult | None = None
 
     def _on_machine(self, message: String) -> None:
         try:
@@ -131,6 +136,8 @@ class IdentifierNode(Node):
             return f'no comparison with the model: {error}'
         stamp = max(cycle.stamp for cycle in cycles)
         self._gap.publish(publish.model_gap(found, stamp))
+        self._found = found.result
+        self._report()
         return summary(found.result)
 
     def _summary(self) -> str:
@@ -152,6 +159,14 @@ class IdentifierNode(Node):
         self._diagnostics.publish(
             diagnostics.status('identifier: session', level, self._summary(), values)
         )
+        if self._found is not None:
+            # The verdict's message has no words: which sizes, what else it could be, and where an
+            # unexplained rest sits.
+            notes = {f'note {n + 1}': text for n, text in enumerate(lines(self._found))}
+            level = diagnostics.OK if self._found.verdict in _GOOD else diagnostics.WARN
+            self._diagnostics.publish(diagnostics.status(
+                'identifier: model gap', level, summary(self._found), notes
+            ))
 
 
 def main(args: list[str] | None = None) -> int:

@@ -463,7 +463,7 @@ function showPose(one, index) {
 
 function showPart(name) {
   if (name.startsWith('cycle:')) drawPoses();
-  else if (['location', 'warnings', 'gap'].includes(name)) drawLocation();
+  else if (['location', 'warnings', 'gap', 'gap_notes'].includes(name)) drawLocation();
   else if (name === 'picture') drawPicture();
   else if (name.startsWith('map:')) drawMaps();
 }
@@ -514,6 +514,7 @@ function drawGap() {
     list.append(element('li', '',
       `${one.key} (${Math.round(100 * one.confidence)} % sure${others})`));
   }
+  for (const text of parts.gap_notes || []) list.append(element('li', 'quiet', text));
   box.append(list);
 }
 
