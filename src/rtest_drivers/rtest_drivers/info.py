@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
@@ -10,6 +10,7 @@ from typing import Any
 from rtest_drivers.provenance import TOPIC
 from rtest_estimation.bagfile import Bag, read_bag
 from rtest_estimation.errors import UserError
+from rtest_estimation.message_reader import DamagedMessage, message_reader
 from rtest_estimation.missing import grouped
 from rtest_estimation.pipeline import Finished
 from rtest_estimation.plain_text import printable
@@ -38,7 +39,7 @@ def describe(path: str | Path, topics: Mapping[str, str] | None = None) -> list[
         finished = estimate_recording(recording)
         lines += _session_lines(recording) + _missing_lines(finished)
         warnings = (*recording.warnings, *_problems(finished), *_not_begun(bag, recording))
-    lines += _software_lines(bag)
+    lines += _mark_lines(bag) + _software_lines(bag)
     return lines + _topic_lines(bag) + [f'warning   {warning}' for warning in warnings]
 
 
@@ -53,19 +54,37 @@ def _file_lines(bag: Bag) -> list[str]:
     return [*lines, f'closed    {"yes" if bag.closed else "no"}']
 
 
+def _texts(bag: Bag, ending: str) -> Iterator[tuple[int, str, str | None]]:
+    """Log time [ns], topic, text of each std_msgs/String on topics that end so; None if damaged."""
+    topics = [
+        topic for topic, (kind, _) in bag.topics.items()
+        if topic.endswith(f'/{ending}') and kind == 'std_msgs/msg/String'
+    ]
+    for topic, definition, time, data in bag.stored(topics) if topics else ():
+        message = message_reader(definition, f'{bag.path}: topic {topic}')(data)
+        yield time, topic, None if isinstance(message, DamagedMessage) else message.data
+
+
+def _mark_lines(bag: Bag) -> list[str]:
+    """What people marked, and how long after the start of the recording."""
+    return [
+        f'mark      at {(time - bag.start) / 1e9:.1f} s: '
+        + ('(damaged)' if text is None else printable(text))
+        for time, _, text in _texts(bag, 'rtest/mark')
+    ]
+
+
 def _configuration(bag: Bag, key: str) -> dict[str, Any] | None:
     """A mapping of what the session recorded of itself; None where it did not.
 
     Raises UserError where it cannot be read.
     """
-    for topic, (kind, _) in bag.topics.items():
-        if topic.endswith(f'/{TOPIC}') and kind == 'std_msgs/msg/String':
-            for message in bag.messages(topic):
-                data = load_yaml(message.data, topic)
-                found = data.get(key, {}) if isinstance(data, dict) else None
-                if not isinstance(found, dict):
-                    raise UserError(f'{topic} cannot be read')
-                return found
+    for _, topic, text in _texts(bag, TOPIC):
+        data = None if text is None else load_yaml(text, topic)
+        found = data.get(key, {}) if isinstance(data, dict) else None
+        if not isinstance(found, dict):
+            raise UserError(f'{topic} cannot be read')
+        return found
     return None
 
 

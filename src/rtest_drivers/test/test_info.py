@@ -1,6 +1,7 @@
 """What `rtest info` says, on sessions from outside and on files that are hardly one."""
 
 import re
+import struct
 from pathlib import Path
 
 import pytest
@@ -55,6 +56,36 @@ def test_a_file_that_is_no_session_is_described_with_the_reason(tmp_path):
     assert any('was not closed' in line for line in lines)
     assert any('no gauge readings' in line for line in lines)
     assert len(describe(McapFile(tmp_path / 'empty').path)) >= 4
+
+
+def written(folder, topic, *texts):
+    """A recording of texts, one a second."""
+    file = McapFile(folder)
+    definition = MessageTypes().definition('std_msgs/msg/String')
+    file.add_topic(topic, definition.name, definition.text, definition.type_hash)
+    for number, text in enumerate(texts):
+        data = text if isinstance(text, bytes) else (
+            b'\0\1\0\0' + struct.pack('<I', len(text.encode()) + 1) + text.encode() + b'\0'
+        )
+        file.write(topic, 1_700_000_000_000_000_000 + number * 1_000_000_000, 0, 0, data)
+    file.flush()
+    return file.path
+
+
+def test_marks_are_listed_with_their_times(tmp_path):
+    lines = describe(written(tmp_path / 'marks', '/cell/rtest/mark', 'door opened', 'coolant on'))
+    assert [line for line in lines if line.startswith('mark ')] == [
+        'mark      at 0.0 s: door opened', 'mark      at 1.0 s: coolant on',
+    ]
+
+
+def test_damaged_texts_are_told(tmp_path):
+    cut = b'\0\1\0\0' + struct.pack('<I', 500) + b'door'
+    lines = describe(written(tmp_path / 'marks', '/rtest/mark', cut))
+    assert any(line.startswith('mark      at 0.0 s: (damaged') for line in lines)
+    lines = describe(written(tmp_path / 'made', '/rtest/configuration', cut))
+    (said,) = (line for line in lines if line.startswith('software'))
+    assert 'rtest/configuration' in said
 
 
 def test_nothing_there(tmp_path):

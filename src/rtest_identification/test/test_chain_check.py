@@ -1,5 +1,7 @@
 """Verdicts on a measuring chain, on chains whose faults are known."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -26,6 +28,7 @@ from rtest_identification.chain_check import (
     sphere_runout,
     temperature,
 )
+from rtest_identification.observations import turns
 from rtest_identification.session_file import load_session
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -177,11 +180,23 @@ def test_a_laser_nest_is_not_judged_by_the_approach() -> None:
     assert not any(what.startswith('gauge') for what in found)
 
 
-def test_the_example_visits_its_first_pose_ten_times() -> None:
-    from pathlib import Path
-
+def example():
     config = Path(__file__).parents[2] / 'rtest_drivers' / 'config' / 'check_example.yaml'
-    plan = load_session(config).plans[-1]
+    return load_session(config)
+
+
+def test_the_example_visits_its_first_pose_ten_times() -> None:
+    (plan,) = (one for one in example().plans if one.cycle == '1a-check')
     same = (plan.commands == plan.commands[0]).all(axis=1)
     assert plan.kind is Kind.STATIC and same.sum() == 10 and len(same) == 19
     assert not same[1::2].any()
+
+
+def test_the_example_stands_still_long_enough_for_a_spectrum_and_turns_nothing() -> None:
+    session = example()
+    plan = session.plans[-1]
+    assert plan.cycle == '1a-standing' and plan.dwell >= 10.0
+    assert not turns(session.machine, plan)
+    # Each stop is one of its own: a tenth of a millimetre from the one before.
+    steps = np.abs(np.diff(plan.commands, axis=0)).max(axis=1)
+    assert steps == pytest.approx(1e-4) and len(steps) == 2

@@ -37,13 +37,16 @@ def run(arguments: argparse.Namespace) -> int:
         raise UserError('echo: which topic? for example /rtest/gauges')
     if not 0.0 < arguments.seconds <= 3600.0:
         raise UserError(f'--seconds {arguments.seconds:g}: expected more than 0, at most 3600')
+    if arguments.count < 0:
+        raise UserError(f'--count {arguments.count}: expected 1 or more, or 0 for no end')
     with topics.looker(chosen_domain(False, arguments.domain)) as look:
         if arguments.what == 'list':
             rows = look.topics()
             for row in rows:
                 print(f'{row.name:32} {row.type:36} {row.publishers:3} publishers '
                       f'{row.subscriptions:3} subscriptions')
-            print(f'{len(rows)} topics')
+            domain = '' if rows else '; is this the domain of the session? --domain N chooses it'
+            print(f'{len(rows)} topics{domain}')
         elif arguments.what == 'hz':
             print(f'{"topic":32} {"1/s":>8} {"kB/s":>9} {"longest gap":>12} {"messages":>9}')
             for name, one in look.rates(arguments.topic, arguments.seconds).items():
