@@ -55,7 +55,7 @@ def _file_lines(bag: Bag) -> list[str]:
 
 
 def _texts(bag: Bag, ending: str) -> Iterator[tuple[int, str, str | None]]:
-    """Log time [ns], topic, text of each std_msgs/String on topics that end so; None if damaged."""
+    """Log time [ns], topic, text of all texts on topics that end so; None for a damaged one."""
     topics = [
         topic for topic, (kind, _) in bag.topics.items()
         if topic.endswith(f'/{ending}') and kind == 'std_msgs/msg/String'
