@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import signal
+from scipy import signal, stats
 
 from rtest_estimation.records import Feedback, GaugeBlock, Status
 
@@ -20,6 +20,8 @@ STILL = 2e-6
 _CHANCE = 0.01
 # Drifts and what a window of Hann smears out of them lie in the first bins.
 _FIRST_BIN = 4
+# Parts of a stretch whose means show how sure a drift is.
+_BLOCKS = 10
 
 
 @dataclass(frozen=True)
@@ -60,6 +62,19 @@ class Standing:
         """(gauges,) slope [m/s]."""
         times = np.arange(len(self.readings)) / self.rate
         return np.polyfit(times, self.readings, 1)[0]
+
+    @property
+    def drift_spread(self) -> np.ndarray:
+        """(gauges,) expanded uncertainty of the slope at 95 % [m/s].
+
+        From the scatter of the means of `_BLOCKS` parts about a line: readings next to each other
+        are not independent where there is hum.
+        """
+        length = len(self.readings) // _BLOCKS
+        means = self.readings[: _BLOCKS * length].reshape(_BLOCKS, length, -1).mean(axis=1)
+        times = np.arange(_BLOCKS) * length / self.rate
+        _, covariance = np.polyfit(times, means, 1, cov=True)
+        return stats.t.ppf(0.975, _BLOCKS - 2) * np.sqrt(covariance[0, 0])
 
     def lines(self, gauge: int) -> list[Line]:
         """Lines that stand out of a gauge's noise, the strongest first.

@@ -41,6 +41,20 @@ def test_drift_is_no_line_and_not_in_the_noise() -> None:
     assert found.lines(0) == []
 
 
+@pytest.mark.parametrize('lines', [(), [(50.0, 0.5e-6), (1.3, 0.1e-6)]])
+def test_the_uncertainty_of_a_drift_covers_it(lines) -> None:
+    """Also with hum, and with something that swings slowly: readings then depend on each other."""
+    drift, rng = 2e-9, np.random.default_rng(8)
+    inside = 0
+    for seed in range(100):
+        # Readings begin anywhere in a period.
+        shifted = [(f * (1.0 + 0.02 * rng.standard_normal()), a) for f, a in lines]
+        found = standing(50.1, 30.0, shifted, drift=drift, seed=seed)
+        inside += abs(found.drift[0] - drift) <= found.drift_spread[0]
+    # 95 of 100 are wanted; fewer than 88 has probability 1e-3 (binomial).
+    assert inside >= 88
+
+
 def test_frequencies_above_half_the_rate_are_folded() -> None:
     # By hand: 60 Hz read at 50 /s is 10 Hz, 50 Hz is nothing at all, 20 Hz stays.
     assert [folded(f, 50.0) for f in (60.0, 50.0, 20.0, 30.0)] == [10.0, 0.0, 20.0, 20.0]

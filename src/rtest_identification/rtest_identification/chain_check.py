@@ -13,6 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import stats
 
 from rtest_estimation import runout
 from rtest_estimation.pipeline import Finished
@@ -20,6 +21,7 @@ from rtest_estimation.records import Kind, NestCalibration, NestKind
 from rtest_estimation.standing import Standing, folded
 
 RIGHT, WRONG, OPEN = 'right', 'wrong', 'open'
+_WORSE = (RIGHT, OPEN, WRONG)
 # A gauge that moves by less of its direction along the nest's axis hardly sees the sphere leave.
 _LEAST_ALONG = 0.2
 # A gain further from one is a wrong unit or scale, not a tilted gauge.
@@ -34,6 +36,9 @@ _NOISE, _LINE = 0.5e-6, 0.2e-6
 _STANDING_S = 10.0
 _DRIFT = 1e-6 / 600.0
 _TEMPERATURE = 0.5
+# Fewer say nothing of how sure a rate is; a thermometer that never changed is taken to show tenths
+# [K].
+_FEWEST_TEMPERATURES, _DISPLAY = 5, 0.1
 _MAINS = (50.0, 60.0)
 _HARMONICS = 3
 
@@ -206,12 +211,14 @@ def noise(standing: Standing | None, spindle_hz: float | None = None) -> list[Fi
             WRONG if bad else RIGHT,
             'switch pumps, fans and the spindle off one by one, earth the shield' if bad else '',
         ))
-        drift = abs(float(standing.drift[index]))
-        good = drift <= _DRIFT
+        drift, spread = standing.drift[index] * 6e8, standing.drift_spread[index] * 6e8
+        verdict = _exceeds(drift, spread, _DRIFT * 6e8)
         found.append(Finding(
-            f'gauge {index + 1} drift', f'{drift * 6e8:.2f} µm in 10 min',
-            f'{_DRIFT * 6e8:g} µm', RIGHT if good else WRONG,
-            '' if good else 'let the gauges warm up, close the doors',
+            f'gauge {index + 1} drift', f'{drift:+.2f} ± {spread:.2f} µm in 10 min',
+            f'{_DRIFT * 6e8:g} µm', verdict, {
+                RIGHT: '', WRONG: 'let the gauges warm up, close the doors',
+                OPEN: 'too much noise to tell in so short a time; mend the noise first',
+            }[verdict],
         ))
     hidden = [f'{mains:g} Hz' for mains in _MAINS if folded(mains, standing.rate) * (
         standing.duration) < 4.0]
@@ -242,14 +249,39 @@ def temperature(sensors: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> Finding
     """Largest change of a thermometer an hour."""
     what, limit = 'temperature', f'{_TEMPERATURE:g} K/h'
     rates = {
-        name: float(np.polyfit((stamps - stamps[0]) / 3.6e12, values, 1)[0])
-        for name, (stamps, values) in sensors.items() if len(stamps) > 2
+        name: found for name, (stamps, values) in sensors.items()
+        if (found := _hourly(stamps, values)) is not None
     }
     if not rates:
         return Finding(what, 'no thermometer', limit, OPEN, 'watch the room and the doors')
-    name = max(rates, key=lambda key: abs(rates[key]))
-    good = math.fabs(rates[name]) <= _TEMPERATURE
-    return Finding(
-        what, f'{name} {rates[name]:+.2f} K/h', limit, RIGHT if good else WRONG,
-        '' if good else 'wait until the machine and the room are steady',
-    )
+    verdicts = {name: _exceeds(*rate, _TEMPERATURE) for name, rate in rates.items()}
+    name = max(rates, key=lambda key: (_WORSE.index(verdicts[key]), abs(rates[key][0])))
+    (rate, spread), verdict = rates[name], verdicts[name]
+    return Finding(what, f'{name} {rate:+.2f} ± {spread:.2f} K/h', limit, verdict, {
+        RIGHT: '', WRONG: 'wait until the machine and the room are steady',
+        OPEN: 'too short or too coarse to tell; record for an hour without measuring',
+    }[verdict])
+
+
+def _hourly(stamps: np.ndarray, values: np.ndarray) -> tuple[float, float] | None:
+    """Change of a thermometer and its expanded uncertainty at 95 % [K/h]; None for too few.
+
+    stamps : (n,) [ns]; values : (n,) [deg C]
+    """
+    good = np.isfinite(values)
+    hours, values = (stamps[good] - stamps[0]) / 3.6e12, values[good]
+    if len(values) < _FEWEST_TEMPERATURES or not hours[-1] > hours[0]:
+        return None
+    (rate, _), covariance = np.polyfit(hours, values, 1, cov=True)
+    scatter = stats.t.ppf(0.975, len(values) - 2) * math.sqrt(max(covariance[0, 0], 0.0))
+    # Of what lies between two steps of its display a thermometer says nothing.
+    steps = np.abs(np.diff(np.unique(values)))
+    step = float(steps.min()) if len(steps) else _DISPLAY
+    return float(rate), scatter + step / float(hours[-1] - hours[0])
+
+
+def _exceeds(value: float, spread: float, limit: float) -> str:
+    """WRONG beyond the limit and RIGHT within it by more than the uncertainty, else OPEN."""
+    if abs(value) - spread > limit:
+        return WRONG
+    return RIGHT if abs(value) + spread <= limit else OPEN
