@@ -18,7 +18,8 @@ from rtest_identification.moves import AxisPath, synchronous_path
 from rtest_identification.nc_program import NcSettings, nc_program
 from rtest_identification.plan_check import NOT_CHECKED, PlanCheck, check_plan
 from rtest_identification.plans import program_name
-from rtest_identification.session_file import DYNAMIC, PACE, SessionConfig
+from rtest_identification.session_cycle import DYNAMIC, PACE
+from rtest_identification.session_file import SessionConfig
 
 COVERAGE_FACTOR = 2.0
 

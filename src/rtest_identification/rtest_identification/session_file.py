@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import re
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -14,41 +13,33 @@ import numpy as np
 from rtest_estimation.errors import UserError
 from rtest_estimation.records import CyclePlan, Kind, NestKind
 from rtest_estimation.yaml_text import read_yaml
-from rtest_identification.machine import Axis, Machine, load_machine
+from rtest_identification.machine import Machine, load_machine
 from rtest_identification.moves import Approach, Speeds
 from rtest_identification.plan_check import Spindle, Table
 from rtest_identification.plans import (
-    UNEVEN_DEG,
-    check,
     check_ranges,
-    diagnostic,
     dynamic,
     program_name,
     spindle_runout,
     standing,
-    static,
     thermal,
+)
+from rtest_identification.session_cycle import (
+    BUILD,
+    CHECK,
+    DYNAMIC,
+    THERMAL,
+    dynamic_cycles,
+    read_cycle,
+    repetition,
 )
 from rtest_identification.session_nest import DWELL_S, calibration_plan, laser_checks, nest_kind
 from rtest_identification.session_reader import Reader
 
-STATIC, DIAGNOSTIC, THERMAL, DYNAMIC = 'static', 'diagnostic', 'thermal', 'dynamic'
-CHECK = 'check'
-# Fewer do not tell offset, sine and cosine of an error over the axis from each other.
-FEWEST_STATIONS = 3
-# Closer ones are one pose for the machine and for who looks for its stops.
-CLOSEST_DEG = 0.1
 _RADIUS_MM = (1.0, 100.0)
 # Six points tell a circle from noise.
 _RUNOUT_STATIONS = (6, 360)
-# Less of a turn than this shows no harmonics; nobody waits for more.
-_TURNS = (0.25, 100.0)
 _NAME = re.compile(r'[A-Za-z0-9][A-Za-z0-9._-]*')
-_BUILD = {STATIC: static, DIAGNOSTIC: diagnostic, THERMAL: static, CHECK: check}
-# Of a thermal session: between the starts of its cycles, and from the first to the last of them.
-_EVERY_MIN, _HOURS = (0.1, 24.0 * 60.0), (0.01, 24.0 * 14.0)
-_MOST_CYCLES = 2000
-PACE = ('every_min', 'hours')
 _KEYS = {
     'machine', 'sphere_radius_mm', 'cycle', 'dynamic', 'nest_calibration', 'spindle_runout',
     'setups', 'moves', 'table', 'spindle', 'devices', 'nest', 'verification', 'scan',
@@ -139,15 +130,15 @@ def load_session(path: Path | str, kind: str | None = None) -> SessionConfig:
     reader.only(_KEYS)
     machine = load_machine(path.parent / str(reader.required('machine')))
     radius = reader.number('sphere_radius_mm', 12.7, _RADIUS_MM) * 1e-3
-    turning = _dynamic(reader, machine)
+    turning = dynamic_cycles(reader, machine)
     if 'cycle' in data:
-        kind, stations, dwell = _cycle(reader, machine, kind)
+        kind, stations, dwell = read_cycle(reader, machine, kind)
     elif kind is not None:
         raise UserError(f'{path}: cycle: missing; a {kind} cycle needs its stations')
     else:
         kind, stations, dwell = DYNAMIC, (), 0.0
     nest = nest_kind(reader)
-    every, repetitions = _repetition(reader, kind)
+    every, repetitions = repetition(reader, kind)
     plans: list[CyclePlan] = []
     setups = reader.required('setups')
     if not isinstance(setups, dict) or not setups:
@@ -170,8 +161,8 @@ def load_session(path: Path | str, kind: str | None = None) -> SessionConfig:
                 count = section.integer('stations', 24, _RUNOUT_STATIONS)
                 runout_dwell = section.number('dwell_s', 0.3, DWELL_S)
                 plans.append(spindle_runout(machine, name, sphere, count, runout_dwell))
-        if kind in _BUILD:
-            cycle = _BUILD[kind](machine, name, sphere, *stations, dwell)
+        if kind in BUILD:
+            cycle = BUILD[kind](machine, name, sphere, *stations, dwell)
             plans += thermal(cycle, repetitions) if kind == THERMAL else [cycle]
             plans += [standing(machine, name, sphere)] if kind == CHECK else []
         try:
@@ -189,101 +180,6 @@ def load_session(path: Path | str, kind: str | None = None) -> SessionConfig:
     )
 
 
-def _cycle(
-    reader: Reader, machine: Machine, wanted: str | None
-) -> tuple[str, tuple[np.ndarray, ...], float]:
-    """Kind, stations of each rotary axis [rad], dwell [s]."""
-    keys = {name: f'{name.lower()}_deg' for name in machine.rotary}
-    cycle = reader.section('cycle', {'kind', 'dwell_s', *PACE, *keys.values()})
-    given = cycle.data.get('kind', STATIC)
-    if given not in _BUILD:
-        raise UserError(f'{cycle.where}: kind: expected {" or ".join(_BUILD)}, got {given!r}')
-    kind = wanted or given
-    stations = []
-    for name, key in keys.items():
-        if kind == DIAGNOSTIC and full_turn(machine, name) and (
-            kind != given or key not in cycle.data
-        ):
-            stations.append(np.radians(UNEVEN_DEG))
-        else:
-            stations.append(np.radians(_stations(cycle, key, machine.axes[name])))
-    return kind, tuple(stations), cycle.number('dwell_s', 0.3, DWELL_S)
-
-
-def _repetition(reader: Reader, kind: str) -> tuple[float, int]:
-    """Of the cycles of a thermal session: time from start to start [s], and how many."""
-    cycle = Reader(f'{reader.where}: cycle', reader.data.get('cycle', {}))
-    if kind != THERMAL:
-        for key in PACE:
-            if key in cycle.data and cycle.data.get('kind') != THERMAL:
-                raise UserError(f'{cycle.where}: {key}: expected with kind: {THERMAL} only')
-        return 0.0, 1
-    every = cycle.number('every_min', 15.0, _EVERY_MIN)
-    cycle.required('hours')
-    minutes = 60.0 * cycle.number('hours', 0.0, _HOURS)
-    # A whole number of intervals may be a little less in floating point.
-    count = int(minutes / every + 1e-9) + 1
-    if not 2 <= count <= _MOST_CYCLES:
-        raise UserError(
-            f'{cycle.where}: {minutes / 60.0:g} h with a cycle every {every:g} min are {count} '
-            f'cycles; expected 2 to {_MOST_CYCLES}'
-        )
-    return 60.0 * every, count
-
-
-def _dynamic(reader: Reader, machine: Machine) -> list[tuple[str, float, float]]:
-    """Axis, speed [rad/s] and turns each way of every dynamic cycle; none without the section."""
-    if 'dynamic' not in reader.data:
-        return []
-    section = reader.section('dynamic', {'axis', 'speeds_deg_min', 'turns'})
-    axis, tables = section.required('axis'), [
-        name for name in machine.rotary if name in machine.table_side
-    ]
-    if axis not in tables:
-        raise UserError(
-            f'{section.where}: axis: expected a rotary axis of the table, {" or ".join(tables)}, '
-            f'got {axis!r}'
-        )
-    speeds, turns = section.numbers('speeds_deg_min'), section.numbers('turns')
-    if min(speeds) <= 0.0 or len(set(speeds)) < len(speeds):
-        raise UserError(
-            f'{section.where}: speeds_deg_min: expected different positive numbers, got {speeds}'
-        )
-    lower, upper = _TURNS
-    if len(turns) != len(speeds) or not all(lower <= value <= upper for value in turns):
-        raise UserError(
-            f'{section.where}: turns: expected {lower:g} to {upper:g} for each of the '
-            f'{len(speeds)} speeds, got {turns}'
-        )
-    return [(axis, math.radians(speed) / 60.0, turn)
-            for speed, turn in zip(speeds, turns, strict=True)]
-
-
-def _stations(cycle: Reader, key: str, axis: Axis) -> list[float]:
-    """Stations of a rotary axis [deg] that it can reach, enough of them and each once."""
-    degrees = cycle.numbers(key)
-    if len(degrees) < FEWEST_STATIONS:
-        raise UserError(
-            f'{cycle.where}: {key}: expected {FEWEST_STATIONS} stations or more, got '
-            f'{len(degrees)}: fewer do not tell the errors of {axis.name} from each other'
-        )
-    ordered = sorted(degrees)
-    for first, second in pairwise(ordered):
-        if second - first < CLOSEST_DEG:
-            raise UserError(
-                f'{cycle.where}: {key}: {first:g} and {second:g} are one and the same station; '
-                f'expected {CLOSEST_DEG:g} deg between two or more'
-            )
-    lower, upper = math.degrees(axis.lower), math.degrees(axis.upper)
-    for value in (ordered[0], ordered[-1]):
-        if not lower - 1e-6 <= value <= upper + 1e-6:
-            raise UserError(
-                f'{cycle.where}: {key}: {value:g} is outside the range of {axis.name}, '
-                f'{lower:g} to {upper:g} deg'
-            )
-    return degrees
-
-
 def _names(where: str, setups: dict) -> list[str]:
     """Names of the set-ups as texts; they become names of cycles and files."""
     names: list[str] = []
@@ -297,12 +193,6 @@ def _names(where: str, setups: dict) -> list[str]:
             raise UserError(f'{where}: {name}: given twice')
         names.append(name)
     return names
-
-
-def full_turn(machine: Machine, name: str) -> bool:
-    """Whether a rotary axis reaches the uneven stations of a full turn."""
-    axis = machine.axes[name]
-    return axis.lower <= 0.0 and axis.upper >= math.radians(max(UNEVEN_DEG))
 
 
 def _speeds(reader: Reader) -> Speeds:

@@ -114,7 +114,8 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _is_chain(path: Path, check: str) -> bool:
     """Whether the whole chain is to be checked: the file has the cycles for it."""
-    from rtest_identification.session_file import CHECK, load_session
+    from rtest_identification.session_cycle import CHECK
+    from rtest_identification.session_file import load_session
 
     return check == CHAIN and load_session(path).kind == CHECK
 
@@ -237,7 +238,8 @@ def evaluate(settings: GraphSettings, complete: bool) -> Path:
 
 
 def _again(settings: GraphSettings) -> str:
-    from rtest_identification.session_file import DYNAMIC, load_session
+    from rtest_identification.session_cycle import DYNAMIC
+    from rtest_identification.session_file import load_session
 
     command = 'thermal' if settings.thermal else 'identify'
     if load_session(settings.config).kind == DYNAMIC:
