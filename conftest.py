@@ -1,6 +1,7 @@
 """What every test needs before numpy is imported."""
 
 import os
+import signal
 import time
 from collections.abc import Iterator
 
@@ -10,6 +11,10 @@ import pytest
 # command and the launch file set the same.
 for _name in ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS'):
     os.environ.setdefault(_name, '1')
+
+# A shell that starts something in the background makes it, and all that it starts, deaf to Ctrl-C;
+# the tests end some of what they start by it.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(scope='session', autouse=True)
