@@ -56,7 +56,7 @@ def number(found: dict[str, tuple[str, str]], what: str) -> float:
 
 def test_a_right_chain_is_found_right_and_each_link_was_looked_at(tmp_path, capfd) -> None:
     status, found, err = check(tmp_path, capfd)
-    assert (status, err) == (0, '')
+    assert err == '' and status == 0, err
     wrong = {what for what, (verdict, _) in found.items() if verdict == 'WRONG'}
     left = {what for what, (verdict, _) in found.items() if verdict == 'OPEN'}
     assert wrong == set()

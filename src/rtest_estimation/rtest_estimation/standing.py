@@ -20,6 +20,8 @@ STILL = 2e-6
 _CHANCE = 0.01
 # Drifts and what a window of Hann smears out of them lie in the first bins.
 _FIRST_BIN = 4
+# Around a motion readings still swing, or move already by less than the feedback shows [ns].
+_SETTLE_NS = 500_000_000
 # Parts of a stretch whose means show how sure a drift is.
 _BLOCKS = 10
 
@@ -124,6 +126,7 @@ def longest_standing(
     valid = np.concatenate([(one.status == Status.VALID).all(axis=1) for one in blocks])
     inside = (stamps >= times[0]) & (stamps <= times[-1])
     good = valid & inside & np.isfinite(readings).all(axis=1)
+    good &= _away(stamps, moving) >= _SETTLE_NS
     # A stretch ends with a motion and with a reading that is not good.
     part = np.searchsorted(moving, stamps) + np.cumsum(~good)
     part, stamps, readings = part[good], stamps[good], readings[good]
@@ -139,3 +142,12 @@ def longest_standing(
         (len(stamps) - 1) / float(stamps[-1]),
         np.column_stack([np.interp(even, stamps, column) for column in readings.T]),
     )
+
+
+def _away(stamps: np.ndarray, moving: np.ndarray) -> np.ndarray:
+    """(n,) how far in time from the nearest of the instants `moving` (m,), in order [ns]."""
+    if not len(moving):
+        return np.full(len(stamps), np.iinfo(np.int64).max)
+    after = np.searchsorted(moving, stamps)
+    last, following = moving[np.maximum(after - 1, 0)], moving[np.minimum(after, len(moving) - 1)]
+    return np.minimum(np.abs(stamps - last), np.abs(following - stamps))

@@ -83,6 +83,16 @@ def test_the_longest_stretch_ends_at_motion_and_at_a_bad_reading() -> None:
     assert len(found.readings) == 200 and found.rate == pytest.approx(100.0)
 
 
+def test_readings_near_a_motion_are_left_out() -> None:
+    gauges, feedback = recording()
+    good = [block if n != 220 else gauges[219] for n, block in enumerate(gauges)]
+    found = longest_standing(good, feedback)
+    # The axis moves from 1.0 to 1.2 s; half a second later the stretch begins, and ends with the
+    # recording.
+    assert found.readings[0, 0] == pytest.approx(170e-9, abs=1.1e-9)
+    assert found.readings[-1, 0] == pytest.approx(420e-9)
+
+
 def test_uneven_times_are_made_even() -> None:
     found = longest_standing(*recording(jitter=0.4))
     assert found.rate == pytest.approx(100.0, rel=0.01)

@@ -20,7 +20,8 @@ SPINDLE = 'S'
 # To the first pose of a check.
 VISITS = 10
 # How long the sphere stands still for the noise of the gauges [s], at each of two places so far
-# apart [m]: a drift of 1 um in 10 min is then seen beside a noise of some tenths of a micrometre.
+# above and below its nominal one [m]: a drift of 1 um in 10 min is then seen beside a noise of
+# some tenths of a micrometre.
 STANDING_S, _STANDING_STEP = 30.0, 1e-4
 # Twelve uneven stations of a full turn. Even ones show harmonic n and 12 - n as one and the same;
 # of these the sum of exp(i n C) is at most 0.33 of the number of stations for every n up to 22, so
@@ -227,7 +228,9 @@ def standing(machine: Machine, setup: str, sphere: np.ndarray) -> CyclePlan:
 
     A static cycle in which no rotary axis moves: `observations.stack` leaves it out.
     """
-    commands = _stepped(machine, sphere, np.array([[0.0, 0.0, _STANDING_STEP]]))[:2]
+    # Neither where another cycle may have ended: a stand of its own begins with a motion.
+    ends = _STANDING_STEP * np.array([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]])
+    commands = _stepped(machine, sphere, ends)[1:-1]
     return _plan(machine, Kind.STATIC, setup, 'standing', sphere, commands, STANDING_S)
 
 
