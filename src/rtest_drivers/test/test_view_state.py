@@ -140,6 +140,7 @@ def test_a_node_that_computes_is_busy_and_one_that_is_gone_is_told() -> None:
     for name in ('identifier: session', 'estimator: cycle'):
         state.add_report(Report(name, 0, 'works', {}, 0.0))
     assert device(state, 2.0, 'identifier')['level'] == 'ok'
+    assert device(state, 10.0, 'identifier')['text'] == 'computes: silent for 10 s'
     assert device(state, 60.0, 'identifier')['level'] == 'warn'
     assert device(state, 60.0, 'estimator')['level'] == 'error'
     assert device(state, 121.0, 'identifier')['level'] == 'error'

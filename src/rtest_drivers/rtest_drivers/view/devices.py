@@ -17,6 +17,8 @@ _DRIVER_SILENT_S, _NODE_SILENT_S = 1.5, 3.0
 # A node that computes says nothing meanwhile: so long it may be busy [s].
 _BUSY_S = {'identifier': 120.0, 'thermal': 120.0}
 _LONGEST_BUSY_S = 10.0
+# After a cycle it computes for some seconds; nothing is wrong with that [s].
+_COMPUTES_S = 30.0
 # The rate is that of the last so many seconds.
 _RATE_S = 2.0
 
@@ -125,6 +127,8 @@ def node_health(reports: list[Report], ended: bool, now: float) -> Health:
     if ended:
         return Health(name, IDLE, 'ended with the session', None, said)
     if said > _NODE_SILENT_S:
+        if name in _BUSY_S and said <= _COMPUTES_S:
+            return Health(name, OK, f'computes: silent for {said:.0f} s', None, said)
         if said <= _BUSY_S.get(name, _LONGEST_BUSY_S):
             return Health(name, WARN, f'busy: silent for {said:.0f} s', None, said)
         text = f'silent for {said:.0f} s: the process has ended or hangs'

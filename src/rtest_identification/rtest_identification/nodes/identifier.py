@@ -1,6 +1,9 @@
-"""Node `identifier`: finished cycles in, location errors and error maps out."""
+"""Node `identifier`: finished cycles in; location errors, error maps and model gap out."""
 
 from __future__ import annotations
+
+import os
+import time
 
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
@@ -30,10 +33,17 @@ from rtest_identification.pipeline import Identification, identify
 
 # Verdicts on the model gap that leave nothing to be looked for.
 _GOOD = ('no gap', 'explained')
+# The comparison with the model takes seconds: it waits until no cycle has come for so long [s].
+_REST_S = 1.0
+# Computing gives way to who reads and records.
+_NICE = 5
 
 
 class IdentifierNode(Node):
-    """Identifies anew after every static cycle, with all cycles of the session so far."""
+    """Identifies anew after every static cycle, with all cycles of the session so far.
+
+    Then compares them with the model, unless the next cycle is there already.
+    """
 
     def __init__(self) -> None:
         super().__init__('identifier')
@@ -59,6 +69,8 @@ class IdentifierNode(Node):
         self._cycles: list[CycleRecord] = []
         self._result: Identification | None = None
         self._found: GapResult | None = None
+        # What the comparison with the model said of these cycles; '' until it was made.
+        self._compared, self._came = '', 0.0
 
     def _on_machine(self, message: String) -> None:
         try:
@@ -79,11 +91,15 @@ class IdentifierNode(Node):
             self._begin()
         self._cycles = counted([*self._cycles, cycle])
         if cycle.plan.kind is Kind.STATIC:
+            self._compared, self._came = '', time.monotonic()
             self._identify()
 
     def _on_nest(self, message: NestCalibration) -> None:
         nest = messages.nest_calibration(message)
         self._nests[nest.calibration] = nest
+        if any(c.calibration == nest.calibration and turns(self._machine, c.plan)
+               for c in self._cycles if self._machine is not None):
+            self._compared = ''
 
     def _identify(self) -> None:
         if self._machine is None or not any(turns(self._machine, c.plan) for c in self._cycles):
@@ -113,6 +129,7 @@ class IdentifierNode(Node):
         response.message = self._summary()
         if self._result is not None:
             response.message += f'; {self._find_gap()}'
+            self._report()
         return response
 
     def _used_nests(self) -> list[NestRecord]:
@@ -123,6 +140,12 @@ class IdentifierNode(Node):
         )
 
     def _find_gap(self) -> str:
+        """What the comparison with the model says of the cycles so far; it is made once."""
+        if not self._compared:
+            self._compared = self._compare()
+        return self._compared
+
+    def _compare(self) -> str:
         """Compare model and measurement, publish what was found, and sum it up."""
         cycles = tuple(self._cycles)
         directions = {
@@ -137,7 +160,6 @@ class IdentifierNode(Node):
         stamp = max(cycle.stamp for cycle in cycles)
         self._gap.publish(publish.model_gap(found, stamp))
         self._found = found.result
-        self._report()
         return summary(found.result)
 
     def _summary(self) -> str:
@@ -150,6 +172,9 @@ class IdentifierNode(Node):
         )
 
     def _report(self) -> None:
+        waited = time.monotonic() - self._came > _REST_S
+        if self._result is not None and not self._compared and waited:
+            self._find_gap()
         warnings = self._result.warnings if self._result else ()
         # Waiting is no fault, what cannot be identified is.
         static = any(c.plan.kind is Kind.STATIC for c in self._cycles)
@@ -171,6 +196,7 @@ class IdentifierNode(Node):
 
 def main(args: list[str] | None = None) -> int:
     """Entry point."""
+    os.nice(_NICE)
     return run(IdentifierNode, args)
 
 
