@@ -1,8 +1,8 @@
 """The machine as URDF, made from its chain, so that ROS tools show it and know its frames.
 
-Joints have the letters of the axes, as the encoder feedback has: `robot_state_publisher` with
-`joint_states` remapped to `rtest/cnc/feedback` turns that into tf. Links are `machine` (the bed),
-`table`, `spindle`, `sphere`, `nest_SETUP`, and what lies between, `carried_by_AXIS`.
+Joints have the letters of the axes, as the encoder feedback has; `frames.py` turns both into
+frames. Links are `machine` (the bed), `table`, `spindle`, `sphere`, `nest_SETUP`, and what lies
+between, `carried_by_AXIS`.
 """
 
 from __future__ import annotations
