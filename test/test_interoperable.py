@@ -4,6 +4,7 @@ import dataclasses
 import json
 import shutil
 from functools import cache
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from rtest_drivers.cli import main
 from rtest_drivers.info import describe
+from rtest_drivers.message_types import MessageTypes
 from rtest_drivers.playlist import Playlist
 from rtest_estimation.bagfile import read_bag
 from rtest_identification.gap.offline import gap_recording
@@ -25,6 +27,8 @@ from rtest_identification.offline import identify_recording
 
 SHORT = Path(__file__).resolve().parents[1] / 'bags' / 'short'
 FILE = SHORT / 'short.mcap'
+# Of tf2_msgs/msg/TFMessage in ROS 2 Jazzy.
+TF_HASH = 'RIHS01_e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087'
 SOURCES = {
     '/rtest/machine': '/about', '/rtest/plan': '/plans', '/rtest/gauges': '/nest/readings',
     '/rtest/cnc/feedback': '/axes',
@@ -100,6 +104,15 @@ def test_metadata_is_what_rosbag2_needs():
         }
         assert {profile['reliability'] for profile in profiles} == {'reliable'}
     assert not topics
+
+
+@pytest.mark.skipif(find_spec('tf2_msgs') is None, reason='needs tf2_msgs')
+def test_the_message_of_tf_is_that_of_ros():
+    name = 'tf2_msgs/msg/TFMessage'
+    share = Path(get_package_share_directory('tf2_msgs'))
+    generated = json.loads((share / 'msg' / 'TFMessage.json').read_text())
+    hashes = {one['type_name']: one['hash_string'] for one in generated['type_hashes']}
+    assert hashes[name] == MessageTypes().definition(name).type_hash == TF_HASH
 
 
 @cache

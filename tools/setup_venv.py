@@ -1,9 +1,10 @@
 """Set up .venv: ROS 2 Jazzy, the requirements, rtest_msgs and the packages of this repository.
 
 Run by `make setup`, with the Python that .venv is to be made from. Where a ROS 2 Jazzy is
-sourced it is used; elsewhere ROS comes as wheels (requirements-ros.txt). Each of the three steps
-leaves a stamp in .venv that holds a hash of what the step depends on: a second run does only
-what has changed, and a run after an interruption continues where the stamps end.
+sourced it is used; elsewhere ROS comes as wheels (requirements-ros.txt), and tf2_msgs, which is
+no wheel, from tools/tf2_msgs. Each step leaves a stamp in .venv that holds a hash of what the step
+depends on: a second run does only what has changed, and a run after an interruption continues
+where the stamps end.
 """
 
 # Whoever has too old a Python must get to read so: no syntax newer than Python 3.6 here.
@@ -25,6 +26,7 @@ ROOT = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
 VENV = os.path.join(ROOT, '.venv')
 PYTHON = os.path.join(VENV, 'bin', 'python')
 LOG = os.path.join(VENV, 'setup.log')
+MESSAGES, TRANSFORMS = 'src/rtest_msgs', 'tools/tf2_msgs'
 PACKAGES = ['rtest_estimation', 'rtest_identification', 'rtest_drivers']
 
 # The Python outside of a virtual environment that may be active.
@@ -186,13 +188,14 @@ def repair_wheels(env):
                 file.write(new)
 
 
-def build_messages(env):
-    """Build rtest_msgs and install it into .venv, the prefix that is found without sourcing."""
-    build = os.path.join(VENV, 'build', 'rtest_msgs')
+def build_messages(env, folder):
+    """Build a package of messages into .venv, the prefix that is found without sourcing."""
+    name = os.path.basename(folder)
+    build = os.path.join(VENV, 'build', name)
     packages = site_packages(env)
     # From nothing: a message that was renamed must not live on.
     for parent in (packages, os.path.join(VENV, 'share'), os.path.join(VENV, 'include')):
-        shutil.rmtree(os.path.join(parent, 'rtest_msgs'), ignore_errors=True)
+        shutil.rmtree(os.path.join(parent, name), ignore_errors=True)
     shutil.rmtree(build, ignore_errors=True)
     prefixes = [VENV, *env.get('AMENT_PREFIX_PATH', '').split(os.pathsep)]
     env = dict(env, AMENT_PREFIX_PATH=os.pathsep.join(filter(None, prefixes)))
@@ -204,7 +207,7 @@ def build_messages(env):
         'PYTHON_INSTALL_DIR': os.path.relpath(packages, VENV),
         'BUILD_TESTING': 'OFF',
     }
-    source = os.path.join(ROOT, 'src', 'rtest_msgs')
+    source = os.path.join(ROOT, folder)
     run(env, 'cmake', '-S', source, '-B', build, *(f'-D{k}={v}' for k, v in settings.items()))
     run(env, 'cmake', '--build', build, '--parallel', str(os.cpu_count() or 1))
     run(env, 'cmake', '--install', build)
@@ -248,8 +251,10 @@ def setup():
     base = ' '.join([ROOT, BASE, *sys.version.split(), 'sourced' if ros else 'wheels'])
     tools = ['tools/setup_venv.py', 'tools/rtest_environment.py']
     required = base + '\n' + digest('requirements*.txt', *tools)
-    source = ['requirements-ros.txt', 'src/rtest_msgs/*.*', 'src/rtest_msgs/msg/*.msg']
-    messages = digest(*source, also=base)
+    messages, transforms = (
+        digest('requirements-ros.txt', f'{folder}/*.*', f'{folder}/msg/*.msg', also=base)
+        for folder in (MESSAGES, TRANSFORMS)
+    )
     packages = digest('src/rtest_*/setup.*', also=base)
 
     stamp = read_stamp('requirements')
@@ -261,7 +266,11 @@ def setup():
             install_requirements(env, ros)
     if read_stamp('messages') != messages:
         with step('messages', messages, 'rtest_msgs'):
-            build_messages(env)
+            build_messages(env, MESSAGES)
+    # Where a ROS is sourced it has its own, and two of one name must not meet.
+    if not ros and read_stamp('tf2_msgs') != transforms:
+        with step('tf2_msgs', transforms, 'tf2_msgs'):
+            build_messages(env, TRANSFORMS)
     if read_stamp('packages') != packages:
         with step('packages', packages, ', '.join(PACKAGES)):
             install_packages(env)
