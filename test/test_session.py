@@ -152,6 +152,8 @@ def test_a_session_from_calibration_to_identification(start, tmp_path):
             '/rtest/cycle', '/rtest/location_errors', '/rtest/error_map', '/diagnostics'} <= set(
         recording.topics
     )
+    # Only with --frames.
+    assert not {'/tf', '/tf_static', '/robot_description'} & set(recording.topics)
     assert recording.gauges[0].sequence == 0, 'the first reading is in the recording'
 
     # The command finds in the recording what the node published, bit for bit.

@@ -33,6 +33,7 @@ setup(
             'session = rtest_drivers.nodes.session:main',
             'cell = rtest_drivers.nodes.cell:main',
             'view = rtest_drivers.nodes.view:main',
+            'frames = rtest_drivers.nodes.frames:main',
         ],
     },
 )

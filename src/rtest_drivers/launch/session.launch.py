@@ -16,8 +16,7 @@ from rtest_drivers.graph import (
     session_name,
     session_nodes,
 )
-from rtest_identification.session_file import SessionConfig, load_session
-from rtest_identification.urdf import describe
+from rtest_identification.session_file import load_session
 
 ARGUMENTS = {
     'config': (str(config_path('demo.yaml')), 'session file: machine, cycle, set-ups (YAML)'),
@@ -28,7 +27,7 @@ ARGUMENTS = {
     'namespace': ('', 'of every node and topic'),
     'hold': ('false', 'whether every cycle waits for the service session/start'),
     'view': ('false', 'whether a page shows the session at http://127.0.0.1:8090/'),
-    'frames': ('false', 'whether robot_state_publisher turns the feedback into tf'),
+    'frames': ('false', 'whether tf of the machine is published and recorded'),
 }
 
 
@@ -45,9 +44,9 @@ def graph(context: LaunchContext) -> list[Node]:
         namespace=chosen['namespace'],
         hold=chosen['hold'] == 'true',
         view=(VIEW_HOST, VIEW_PORT) if chosen['view'] == 'true' else None,
+        frames=chosen['frames'] == 'true',
     )
-    session = load_session(config)
-    settings = settings.of(session)
+    settings = settings.of(load_session(config))
     return [
         (LifecycleNode if node.lifecycle else Node)(
             package=node.package,
@@ -59,21 +58,7 @@ def graph(context: LaunchContext) -> list[Node]:
             on_exit=None if node.optional else Shutdown(),
         )
         for node in session_nodes(settings)
-    ] + ([_frames(session, settings)] if chosen['frames'] == 'true' else [])
-
-
-def _frames(session: SessionConfig, settings: GraphSettings) -> Node:
-    """The machine's joints have the names of the axes in the feedback."""
-    return Node(
-        package='robot_state_publisher',
-        executable='robot_state_publisher',
-        namespace=settings.namespace,
-        parameters=[{
-            'robot_description': describe(session),
-            'use_sim_time': settings.simulate is not None,
-        }],
-        remappings=[('joint_states', 'rtest/cnc/feedback')],
-    )
+    ]
 
 
 def generate_launch_description() -> LaunchDescription:

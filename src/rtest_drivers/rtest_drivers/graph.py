@@ -7,8 +7,9 @@ import re
 import tempfile
 import time
 import uuid
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,7 +18,7 @@ from rtest_estimation.errors import UserError
 if TYPE_CHECKING:
     from rtest_identification.session_file import Device, SessionConfig
 
-ParameterValue = str | int | float | bool
+ParameterValue = str | int | float | bool | list[str]
 
 # What ends the session when it ends, and what must see everybody else's last message.
 LEADER = 'session'
@@ -25,6 +26,10 @@ LAST = 'recorder'
 LOGS = 'log'
 # Exit status of the leader when the recording was closed but something is missing in it.
 INCOMPLETE = 3
+# What a recorder records: names or patterns, below its namespace where no slash begins them.
+RECORDED = ['rtest/.*', '/diagnostics']
+# What a viewer needs besides to show the machine as it moves.
+RECORDED_FRAMES = ['robot_description', '/tf', '/tf_static']
 # Simulated seconds per second at which nodes on two processor cores lose nothing.
 RATE = 10.0
 # Where the page is served: on this computer only.
@@ -74,6 +79,7 @@ class GraphSettings:
     address : where the simulated cell is to be reached by its drivers (AF_UNIX)
     hold : whether every cycle waits until it is asked for
     view : address and port of the page that shows the session; None for no page
+    frames : whether the machine's frames are published as tf, and recorded
     """
 
     config: Path
@@ -90,6 +96,7 @@ class GraphSettings:
     address: str = field(default_factory=lambda: cell_address())
     hold: bool = False
     view: tuple[str, int] | None = None
+    frames: bool = False
 
     def __post_init__(self) -> None:
         """Refuse names that would become a wrong path or a wrong ROS argument (UserError)."""
@@ -159,11 +166,15 @@ def session_nodes(settings: GraphSettings) -> tuple[GraphNode, ...]:
     simulated = settings.simulate is not None
     clock: dict[str, ParameterValue] = {'use_sim_time': simulated}
     driver: dict[str, ParameterValue] = {'backend': 'cell', 'address': settings.address, **clock}
+    recorded = RECORDED + (RECORDED_FRAMES if settings.frames else [])
     nodes = [
         GraphNode(
             LAST,
             'rtest_drivers',
-            {'out': str(settings.out), 'session': settings.session, **clock},
+            {
+                'out': str(settings.out), 'session': settings.session, 'topics': recorded,
+                **clock,
+            },
         ),
         GraphNode(
             'estimator',
@@ -216,6 +227,8 @@ def session_nodes(settings: GraphSettings) -> tuple[GraphNode, ...]:
     )
     if settings.view is not None:
         nodes.append(view_node(*settings.view))
+    if settings.frames:
+        nodes.append(frames_node(clock))
     return tuple(nodes)
 
 
@@ -224,6 +237,16 @@ def view_node(host: str, port: int) -> GraphNode:
     if not 0 <= port <= 65535:
         raise UserError(f'--port {port}: expected a number from 0 to 65535')
     return GraphNode('view', 'rtest_drivers', {'host': host, 'port': port}, optional=True)
+
+
+def frames_node(clock: Mapping[str, ParameterValue]) -> GraphNode:
+    """The node that publishes tf. Raises UserError where its messages are not installed."""
+    if find_spec('tf2_msgs') is None:
+        raise UserError(
+            'frames: cannot import tf2_msgs, the messages of tf; install ros-jazzy-tf2-msgs, or '
+            'run `make setup` where ROS comes as wheels'
+        )
+    return GraphNode('frames', 'rtest_drivers', dict(clock), optional=True)
 
 
 def _identifier(settings: GraphSettings, clock: dict[str, ParameterValue]) -> GraphNode:

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from rtest_drivers import cli
+from rtest_drivers import cli, graph
 from rtest_drivers.commands import session
 from rtest_drivers.commands.identify import _found, _missing, default_output, recording_name
 from rtest_drivers.config import config_path
@@ -85,6 +85,16 @@ def test_a_users_mistake_is_one_line(capsys, tmp_path, monkeypatch, arguments, e
     assert err.startswith('rtest: ') and err.count('\n') == 1
     assert expected in err
     assert not list(tmp_path.iterdir()), 'a mistake leaves nothing behind'
+
+
+def test_frames_without_the_messages_of_tf_are_refused_in_one_line(
+    capsys, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(graph, 'find_spec', lambda name: None)
+    status, out, err = run(capsys, 'session', '--frames', '--out', str(tmp_path / 'out'))
+    assert status == 2 and not out and err.count('\n') == 1
+    assert 'cannot import tf2_msgs' in err and 'ros-jazzy-tf2-msgs' in err
+    assert not list(tmp_path.iterdir())
 
 
 def test_an_earlier_session_is_never_overwritten(capsys, tmp_path):

@@ -9,8 +9,10 @@ from types import ModuleType, SimpleNamespace
 
 import pytest
 
+from rtest_drivers import graph
 from rtest_drivers.config import config_path
 from rtest_drivers.graph import GraphSettings, session_nodes
+from rtest_estimation.errors import UserError
 
 LAUNCH_FILE = Path(__file__).parents[1] / 'launch' / 'session.launch.py'
 
@@ -90,9 +92,31 @@ def test_real_drivers_are_not_started(launch_file):
     assert not {'cell', 'gauges', 'cnc'} & {node.name for node in start(launch_file)}
 
 
-def test_every_executable_is_installed(launch_file, tmp_path):
+def test_frames_are_recorded_and_their_end_does_not_end_the_session(launch_file, monkeypatch):
+    monkeypatch.setattr(graph, 'find_spec', lambda name: name)
+    nodes = {node.name: node for node in start(launch_file)}
+    assert 'frames' not in nodes
+    assert not {'/tf', '/tf_static'} & set(nodes['recorder'].parameters[0]['topics'])
+    for truth in ('', str(config_path('cell_demo.yaml'))):
+        nodes = {node.name: node for node in start(launch_file, frames='true', simulate=truth)}
+        assert nodes['frames'].parameters == [{'use_sim_time': bool(truth)}]
+        assert nodes['frames'].on_exit is None and nodes['session'].on_exit.kind == 'Shutdown'
+        assert nodes['recorder'].parameters[0]['topics'] == [
+            'rtest/.*', '/diagnostics', 'robot_description', '/tf', '/tf_static',
+        ]
+
+
+def test_without_the_messages_of_tf_frames_are_refused(launch_file, monkeypatch):
+    monkeypatch.setattr(graph, 'find_spec', lambda name: None)
+    with pytest.raises(UserError, match='install ros-jazzy-tf2-msgs'):
+        start(launch_file, frames='true')
+
+
+def test_every_executable_is_installed(launch_file, monkeypatch):
+    monkeypatch.setattr(graph, 'find_spec', lambda name: name)
     sources = LAUNCH_FILE.parents[2]
-    for node in start(launch_file, simulate=str(config_path('cell_demo.yaml'))):
+    truth = str(config_path('cell_demo.yaml'))
+    for node in start(launch_file, simulate=truth, frames='true', view='true'):
         assert f"'{node.executable} = {node.package}.nodes.{node.executable}:main'" in (
             sources / node.package / 'setup.py'
         ).read_text()

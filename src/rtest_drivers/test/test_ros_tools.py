@@ -24,7 +24,7 @@ def test_layouts_show_topics_that_exist(name) -> None:
     json.loads(text) if name.endswith('json') else ET.fromstring(text)
     topics = set(TOPIC.findall(text))
     assert len(topics) >= 3
-    assert topics <= {f'/{topic.lstrip("/")}' for topic in CONTRACT} | {'/robot_description'}
+    assert topics <= {f'/{topic.lstrip("/")}' for topic in CONTRACT}
 
 
 def test_every_panel_of_the_foxglove_layout_is_placed_once() -> None:

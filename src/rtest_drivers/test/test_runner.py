@@ -295,6 +295,7 @@ def test_arguments_keep_their_types(tmp_path):
     assert 'session:="12"' in session and 'use_sim_time:=true' in session
     assert f'config:="{tmp_path}/a b.yaml"' in session
     assert 'rate:=10.0' in ros_arguments(nodes['cell'])
+    assert 'topics:=["rtest/.*", "/diagnostics"]' in ros_arguments(nodes['recorder'])
     assert not any('use_sim_time' in a for a in ros_arguments(nodes['cell']))
 
 

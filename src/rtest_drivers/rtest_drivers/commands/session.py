@@ -25,6 +25,7 @@ from rtest_drivers.graph import (
     VIEW_HOST,
     VIEW_PORT,
     GraphSettings,
+    frames_node,
     session_name,
     view_node,
 )
@@ -63,6 +64,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         help='of the page (default: 127.0.0.1, this computer only)')
     parser.add_argument('--port', type=int, default=VIEW_PORT, metavar='N',
                         help=f'of the page (default: {VIEW_PORT})')
+    parser.add_argument('--frames', action='store_true',
+                        help='publish tf of the machine, moved by its feedback, and record it')
     parser.add_argument('--remap', action='append', default=[], metavar='FROM:=TO',
                         help='remap a topic or service in all nodes; may be given several times')
     parser.add_argument('--namespace', default='', metavar='NS',
@@ -101,7 +104,10 @@ def run(arguments: argparse.Namespace) -> int:
         remaps=tuple(arguments.remap),
         hold=arguments.hold,
         view=(arguments.host, arguments.port) if arguments.view else None,
+        frames=arguments.frames,
     )
+    if settings.frames:
+        frames_node({})
     if settings.view is not None:
         view_node(*settings.view)
         check_address(*settings.view)

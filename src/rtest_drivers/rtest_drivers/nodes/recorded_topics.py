@@ -42,7 +42,8 @@ from rtest_estimation.sequence import SequenceCheck
 
 # The topics of the graph: recorded from their first message, so subscribed to before it.
 # Latched ones with depth 100: the publisher's depth decides what a late subscriber gets.
-CONTRACT: dict[str, tuple[type, QoSProfile]] = {
+# A name stands for a type that a ROS may lack: it is imported where the topic is wanted.
+CONTRACT: dict[str, tuple[type | str, QoSProfile]] = {
     'rtest/machine': (String, LATCHED_100),
     'rtest/plan': (CyclePlan, LATCHED_100),
     'rtest/gauges': (GaugeSamples, STREAM),
@@ -57,6 +58,9 @@ CONTRACT: dict[str, tuple[type, QoSProfile]] = {
     'rtest/markers': (MarkerArray, LATCHED_100),
     'rtest/mark': (String, LATCHED_100),
     '/diagnostics': (DiagnosticArray, STREAM),
+    'robot_description': (String, LATCHED_100),
+    '/tf': ('tf2_msgs/msg/TFMessage', STREAM),
+    '/tf_static': ('tf2_msgs/msg/TFMessage', LATCHED_100),
 }
 # Messages of one topic taken in a row.
 BATCH = 100
@@ -101,7 +105,11 @@ class RecordedTopics:
         for name, (message_type, qos) in CONTRACT.items():
             usual = name if name.startswith('/') else f'{namespace}/{name}'
             resolved = self._node.resolve_topic_name(name)
-            if self._wanted(usual) or self._wanted(resolved):
+            if not (self._wanted(usual) or self._wanted(resolved)):
+                continue
+            if isinstance(message_type, str):
+                self._subscribe_by_name(resolved, [message_type], qos)
+            else:
                 self._subscribe(resolved, message_type, qos)
 
     def stop(self) -> None:
@@ -210,9 +218,9 @@ class RecordedTopics:
                     self._node.destroy_subscription(subscription)
                     self._subscribe(name, message_type, qos)
             elif name not in self.problems:
-                self._subscribe_to_found(name, types, qos)
+                self._subscribe_by_name(name, types, qos)
 
-    def _subscribe_to_found(self, name: str, types: list[str], qos: QoSProfile) -> None:
+    def _subscribe_by_name(self, name: str, types: list[str], qos: QoSProfile) -> None:
         package, _, type_name = types[0].partition('/msg/')
         try:
             message_type = getattr(import_module(f'{package}.msg'), type_name)

@@ -28,12 +28,12 @@ from rclpy.task import Future
 from std_srvs.srv import Trigger
 
 from rtest_drivers.clock import HostClock
+from rtest_drivers.graph import RECORDED
 from rtest_drivers.nodes.recorded_topics import RecordedTopics
 from rtest_drivers.session_writer import MEMORY, NOT_WRITTEN, SessionWriter
 from rtest_estimation.errors import UserError
 from rtest_estimation.nodes.qos import STREAM
 
-DEFAULT_TOPICS = ['rtest/.*', '/diagnostics']
 # A recording is complete when nothing came for this long after the others finished [s].
 QUIET = 0.3
 PATIENCE = 3.0
@@ -60,7 +60,7 @@ class Recorder(Node):
         out = self._parameter('out', '')
         self.session = self._parameter('session', '')
         memory = self._parameter('memory_mb', MEMORY // 1_000_000)
-        patterns = [self._pattern(text) for text in self._parameter('topics', DEFAULT_TOPICS)]
+        patterns = [self._pattern(text) for text in self._parameter('topics', RECORDED)]
         self._simulated = self.get_parameter('use_sim_time').value
         # A clock that is set meanwhile must not part the messages before from those after.
         self._host = HostClock()
