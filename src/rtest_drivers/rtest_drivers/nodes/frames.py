@@ -22,7 +22,7 @@ from geometry_msgs.msg import Transform as TransformMessage
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
-from rclpy.qos import qos_profile_sensor_data
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Header, String
 from tf2_msgs.msg import TFMessage
@@ -30,7 +30,7 @@ from tf2_msgs.msg import TFMessage
 from rtest_estimation import messages
 from rtest_estimation.errors import UserError
 from rtest_estimation.nodes import diagnostics
-from rtest_estimation.nodes.qos import LATCHED
+from rtest_estimation.nodes.qos import LATCHED, STREAM
 from rtest_estimation.nodes.run import run
 from rtest_identification.frames import (
     DescriptionError,
@@ -48,6 +48,8 @@ PERIOD = 49_500_000
 _BACK = 500_000_000
 # As listeners of tf expect it.
 _DEPTH = 100
+# A driver does not wait for what this node has not taken yet.
+_LOSSY = QoSProfile(depth=STREAM.depth, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
 class FramesNode(Node):
@@ -74,9 +76,7 @@ class FramesNode(Node):
         self._tf_static = self.create_publisher(TFMessage, '/tf_static', LATCHED)
         self._diagnostics = diagnostics.Diagnostics(self)
         self.create_subscription(String, 'robot_description', self._on_description, LATCHED)
-        self.create_subscription(
-            JointState, 'rtest/cnc/feedback', self._on_feedback, qos_profile_sensor_data
-        )
+        self.create_subscription(JointState, 'rtest/cnc/feedback', self._on_feedback, _LOSSY)
         self.create_timer(1.0, self._report, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def _on_description(self, message: String) -> None:
