@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 
 import numpy as np
 
 from rtest_estimation.dwell import ROTARY_LETTERS
-from rtest_estimation.records import CyclePlan
+from rtest_estimation.missing import grouped
+from rtest_estimation.records import CyclePlan, Kind, Missing, NestKind
 
 NANOSECONDS = 1_000_000_000
 
@@ -70,6 +72,33 @@ def pose_count(poses: int, points: int, missing: int) -> str:
     """For example ``82 of 84 poses, 2 missing``."""
     text = f'{points} of {poses} poses'
     return f'{text}, {missing} missing' if missing else text
+
+
+def outcome(plan: CyclePlan, points: int, missing: int, reasons: Mapping[str, str]) -> str:
+    """For example ``82 of 84 poses, 2 missing (3, 7: no gauge readings)``.
+
+    points, missing : numbers of poses
+    reasons : why poses are missing, under ``pose 3`` and so on; among other values
+    """
+    if plan.kind is Kind.DYNAMIC and not missing:
+        return 'recorded'
+    text = pose_count(len(plan.commands), points, missing)
+    if missing:
+        poses = [
+            Missing(int(pose.removeprefix('pose ')), reason)
+            for pose, reason in reasons.items()
+            if pose.startswith('pose ')
+        ]
+        # Every reason is told with the result of the session.
+        first, *more = grouped(poses) or ['']
+        text += f' ({first}{"; ..." if more else ""})' if first else ''
+    return text
+
+
+def calibration_outcome(residual: float, kind: int) -> str:
+    """For example ``residual 0.12 µm``. residual : of the nest [m]; kind : a NestKind."""
+    text = f'residual {residual * 1e6:.2f} µm'
+    return f'{text} before the correction' if kind == NestKind.LASER else text
 
 
 class Progress:

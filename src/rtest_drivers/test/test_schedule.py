@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,12 +15,14 @@ from rtest_drivers.schedule import (
     POSE_MARGIN_S,
     STOPPED_S,
     Progress,
+    calibration_outcome,
+    outcome,
     path_duration,
     pose_count,
     pose_patience,
     turn,
 )
-from rtest_estimation.records import CyclePlan, Kind
+from rtest_estimation.records import CyclePlan, Kind, NestKind
 
 
 def plan(commands, feed: float = 0.0) -> CyclePlan:
@@ -43,6 +46,35 @@ def test_a_slow_feed_takes_longer():
 def test_missing_poses_are_told_only_where_there_are_some():
     assert pose_count(84, 84, 0) == '84 of 84 poses'
     assert pose_count(84, 82, 2) == '82 of 84 poses, 2 missing'
+
+
+def test_the_first_reason_of_missing_poses_is_told():
+    cycle = plan(np.zeros((9, 2)))
+    reasons = {'cycle': 'a', 'pose 3': 'no gauge readings', 'pose 4': 'no gauge readings'}
+    assert outcome(cycle, 7, 2, reasons) == (
+        '7 of 9 poses, 2 missing (3-4: no gauge readings)'
+    )
+    assert outcome(cycle, 6, 3, {**reasons, 'pose 7': 'not reached'}) == (
+        '6 of 9 poses, 3 missing (3-4: no gauge readings; ...)'
+    )
+
+
+def test_an_outcome_needs_no_reasons():
+    """They may be lost on the way."""
+    cycle = plan(np.zeros((9, 2)))
+    assert outcome(cycle, 7, 2, {}) == '7 of 9 poses, 2 missing'
+    assert outcome(cycle, 9, 0, {'pose 3': 'of another cycle'}) == '9 of 9 poses'
+
+
+def test_a_dynamic_cycle_is_recorded():
+    cycle = replace(plan(np.zeros((9, 2))), kind=Kind.DYNAMIC)
+    assert outcome(cycle, 0, 0, {}) == 'recorded'
+    assert outcome(cycle, 0, 2, {}) == '0 of 9 poses, 2 missing'
+
+
+def test_the_residual_of_a_laser_nest_is_that_before_the_correction():
+    assert calibration_outcome(1.234e-7, NestKind.CONTACT) == 'residual 0.12 µm'
+    assert calibration_outcome(2e-6, NestKind.LASER) == 'residual 2.00 µm before the correction'
 
 
 # The longest move is 2 s, or with the dwell 2.5 s.

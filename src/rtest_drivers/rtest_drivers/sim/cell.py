@@ -14,13 +14,15 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from rtest_drivers.sim import gauges, laser
-from rtest_drivers.sim.faults import Window, timed, window
-from rtest_drivers.sim.kinematics import sphere_in_table, table_to_spindle, turn
+from rtest_drivers.sim.encoders import EncoderReadings
+from rtest_drivers.sim.faults import Window, of_cycle, skipped_poses, timed
+from rtest_drivers.sim.gauge_readings import GaugeReadings
+from rtest_drivers.sim.kinematics import sphere_in_table, table_to_sphere
+from rtest_drivers.sim.limits import check
 from rtest_drivers.sim.motion import SPINDLE, Timeline
 from rtest_drivers.sim.truth import Truth
-from rtest_drivers.sim.warming import WarmErrors
+from rtest_drivers.sim.warming import Thermometers, WarmErrors
 from rtest_estimation.dwell import turns
-from rtest_estimation.errors import UserError
 from rtest_estimation.records import (
     CyclePlan,
     Feedback,
@@ -76,16 +78,16 @@ class Cell:
         self._setup: str | None = None
         self._nests: list[gauges.Nest | laser.LaserNest] = []
         self._windows: list[Window] = timed(truth.faults, epoch)
-        self._reading = 0
-        self._sequence = 0
-        self._feedback = 0
-        self._latest: Feedback | None = None
-        self._noise = np.random.default_rng([truth.seed, _READINGS])
-        self._outliers = np.random.default_rng([truth.seed, _OUTLIERS])
-        self._encoder_noise = np.random.default_rng([truth.seed, _ENCODERS])
         self._warm_from: int | None = None
-        self._temperatures = 0
-        self._thermometer_noise = np.random.default_rng([truth.seed, _THERMOMETERS])
+        # Numbers of the next reading, feedback and temperature.
+        self._reading = self._feedback = self._temperature = 0
+        readings, outliers, encoders, thermometers = (
+            np.random.default_rng([truth.seed, stream])
+            for stream in (_READINGS, _OUTLIERS, _ENCODERS, _THERMOMETERS)
+        )
+        self._gauges = GaugeReadings(truth.gauges, readings, outliers)
+        self._encoders = EncoderReadings(truth.encoders, truth.machine, self.axes, encoders)
+        self._thermometers = Thermometers(truth.warming, thermometers) if truth.warming else None
 
     @property
     def axes(self) -> tuple[str, ...]:
@@ -172,11 +174,7 @@ class Cell:
     def _start(self, plan: CyclePlan, start: int) -> None:
         if plan.kind is Kind.STATIC and self._warm_from is None:
             self._warm_from = start
-        skipped = {
-            fault.pose
-            for fault in self.truth.faults
-            if fault.kind == 'pose_skipped' and fault.cycle == plan.cycle
-        }
+        skipped = skipped_poses(self.truth.faults, plan.cycle)
         turning = turns(plan)
         dwell = _REST if turning else round(plan.dwell * 1e9)
         columns = [self.axes.index(name) for name in plan.axes]
@@ -207,11 +205,7 @@ class Cell:
             clock += dwell
         self._run = Run(plan, start, clock)
         whole = start, clock + _LINGER_NS
-        self._windows += [
-            window(fault, *(poses[fault.pose] if fault.pose is not None else whole))
-            for fault in self.truth.faults
-            if fault.cycle == plan.cycle and (fault.pose is None or fault.pose in poses)
-        ]
+        self._windows += of_cycle(self.truth.faults, plan.cycle, poses, whole)
 
     def _mount(self, plan: CyclePlan) -> None:
         rng = self._named(f'nest/{len(self._nests)}/{plan.setup}')
@@ -221,14 +215,6 @@ class Cell:
         return np.random.default_rng([self.truth.seed, zlib.crc32(name.encode())])
 
     # --- what is read ---
-
-    def _active(self, kind: str, times: np.ndarray) -> np.ndarray:
-        """Whether a fault of this kind is on at `times` (n,)."""
-        on = np.zeros(len(times), dtype=bool)
-        for item in self._windows:
-            if item.fault.kind == kind:
-                on |= (times >= item.start) & (times < item.end)
-        return on
 
     def _read_gauges(self, blocks: list[GaugeBlock], wait: Wait) -> None:
         data = self.truth.gauges
@@ -242,37 +228,15 @@ class Cell:
             )
             numbers = (firsts[:, None] * data.batch + np.arange(data.batch)).ravel()
             times = self.epoch + (numbers + 1) * data.period
-            values, status = self._measure(times)
-            silent = self._active('gauge_silent', times)
-            lost = self._active('lost_block', times)
-            for first in range(0, len(times), data.batch):
-                part = slice(first, first + data.batch)
-                if silent[part].any():
-                    continue
-                if not lost[part].any():
-                    blocks.append(
-                        GaugeBlock(
-                            int(times[first]) + round(data.late * 1e9),
-                            self._sequence,
-                            data.period * 1e-9 if data.batch > 1 else 0.0,
-                            values[part],
-                            status[part],
-                        )
-                    )
-                self._sequence += data.batch
+            blocks += self._gauges.blocks(times, *self._measure(times), self._windows)
             self._reading = stop
 
     def _measure(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         data = self.truth.gauges
-        shape = (len(times), len(data.tilt))
         # Drawn whatever the state, so that every reading keeps its own noise.
-        noise = data.noise * self._noise.standard_normal(shape)
-        if data.outliers:
-            hit = self._outliers.random((*shape, 2))
-            # Two uniform numbers: whether it is one, and how large (either way, up to the size).
-            noise += (hit[..., 0] < data.outliers) * data.outlier * (2.0 * hit[..., 1] - 1.0)
-        values = np.zeros(shape)
-        status = np.full(shape, Status.NO_SIGNAL, dtype=np.uint8)
+        noise = self._gauges.noise(len(times))
+        values = np.zeros(noise.shape)
+        status = np.full(noise.shape, Status.NO_SIGNAL, dtype=np.uint8)
         state = self._timeline.at(times)
         mounted = state.nest >= 0
         if mounted.any():
@@ -281,7 +245,9 @@ class Cell:
             if data.friction:
                 velocity = self._velocity(times[mounted], state.positions[mounted])
                 sphere += gauges.friction(data, velocity)
-            surface = self._to_sphere(state.positions[mounted]) if data.laser else None
+            surface = None
+            if data.laser:
+                surface = table_to_sphere(self.truth.machine, state.positions[mounted])
             held, found = values[mounted], status[mounted]
             for index in np.unique(state.nest[mounted]):
                 rows = state.nest[mounted] == index
@@ -289,7 +255,7 @@ class Cell:
                     sphere[rows], noise[mounted][rows], None if surface is None else surface[rows]
                 )
             values[mounted], status[mounted] = held, found
-        return self._spoil(times, values, status)
+        return values, status
 
     def _sphere(self, positions: np.ndarray, times: np.ndarray) -> np.ndarray:
         """True sphere centre in the table frame (n, 3) [m]; the run-out turns with the spindle.
@@ -310,12 +276,6 @@ class Cell:
             return np.full(len(times), -1.0)
         return (times - self._warm_from) * 1e-9
 
-    def _to_sphere(self, positions: np.ndarray) -> np.ndarray:
-        """(n, 3, 3) from the table to the sphere, which turns with the spindle; nominal."""
-        machine = self.truth.machine
-        spindle = turn(np.array([0.0, 0.0, 1.0]), -positions[:, -1])[:, :3, :3]
-        return spindle @ table_to_spindle(machine, positions[:, :-1])
-
     def _velocity(self, times: np.ndarray, positions: np.ndarray) -> np.ndarray:
         """(n, 3) how the linear axes carry the sphere, frame ``table`` [m/s]."""
         machine = self.truth.machine
@@ -327,108 +287,21 @@ class Cell:
             ends.append(sphere_in_table(machine, moved))
         return (ends[1] - ends[0]) / (2e-9 * _HALF_SPAN)
 
-    def _spoil(
-        self, times: np.ndarray, values: np.ndarray, status: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        data = self.truth.gauges
-        for item in self._windows:
-            kind = item.fault.kind
-            if kind not in ('gauge_out_of_range', 'gauge_nan', 'gauge_error'):
-                continue
-            rows = np.flatnonzero((times >= item.start) & (times < item.end))
-            which = slice(None) if item.fault.gauge is None else slice(
-                item.fault.gauge, item.fault.gauge + 1
-            )
-            if kind == 'gauge_out_of_range':
-                values[rows, which], status[rows, which] = data.upper, Status.OUT_OF_RANGE
-            elif kind == 'gauge_nan':
-                values[rows, which] = np.nan
-            else:
-                values[rows, which], status[rows, which] = 0.0, Status.DEVICE_ERROR
-        return values, status
-
     def _read_encoders(self, feedback: list[Feedback], wait: Wait) -> None:
-        data = self.truth.encoders
-        complete = (self.now - self.epoch) // data.period
+        period = self.truth.encoders.period
+        complete = (self.now - self.epoch) // period
         if complete <= self._feedback:
             return
-        numbers = self._wanted(np.arange(self._feedback, complete), data.period, wait)
-        times = self.epoch + (numbers + 1) * data.period
-        machine = self.truth.machine
-        noise = [
-            data.rotary_noise if machine.axes[name].rotary else data.linear_noise
-            for name in machine.letters
-        ]
-        positions = self._timeline.at(times).positions
-        positions += self._encoder_noise.standard_normal(positions.shape) * [
-            *noise, data.rotary_noise
-        ]
-        step = np.array([
-            data.rotary_step if name == SPINDLE or machine.axes[name].rotary else data.linear_step
-            for name in self.axes
-        ])
-        if step.any():
-            stepped = np.round(positions / np.where(step, step, 1.0)) * step
-            positions = np.where(step, stepped, positions)
-        stale = self._active('feedback_stale', times)
-        silent = self._active('feedback_silent', times)
-        for index, time in enumerate(times):
-            fresh = Feedback(int(time), self.axes, positions[index])
-            if self._latest is None or not stale[index]:
-                self._latest = fresh
-            if not silent[index]:
-                feedback.append(self._latest)
+        numbers = self._wanted(np.arange(self._feedback, complete), period, wait)
+        times = self.epoch + (numbers + 1) * period
+        feedback += self._encoders.read(times, self._timeline.at(times).positions, self._windows)
         self._feedback = complete
 
     def _read_thermometers(self, temperatures: list[Temperature]) -> None:
-        warming = self.truth.warming
-        if warming is None:
+        if self._thermometers is None:
             return
-        complete = (self.now - self.epoch) // warming.period
-        times = self.epoch + (np.arange(self._temperatures, complete) + 1) * warming.period
-        noise = warming.noise * self._thermometer_noise.standard_normal(
-            (len(times), len(warming.sensors))
-        )
-        seconds = self._warm_for(times)
-        for column, sensor in enumerate(warming.sensors.values()):
-            noise[:, column] += warming.value(sensor, seconds)
-        temperatures += [
-            Temperature(int(time), name, float(value), warming.noise**2)
-            for time, row in zip(times, noise, strict=True)
-            for name, value in zip(warming.sensors, row, strict=True)
-        ]
-        self._temperatures = complete
-
-
-def check(plan: CyclePlan, truth: Truth) -> None:
-    """Refuse a plan the simulated machine cannot do.
-
-    Raises UserError naming cycle, axis, pose and what is expected.
-    """
-    where = f'plan {plan.cycle!r}'
-    axes = truth.machine.axes
-    if turns(plan):
-        turned = [k for k, name in enumerate(plan.axes) if name in axes and axes[name].rotary]
-        steps = np.abs(np.diff(plan.commands[:, turned], axis=0))
-        if not plan.feed > 0.0 or steps.max(axis=1).min() < 1e-9:
-            raise UserError(
-                f'{where}: a dynamic cycle turns a rotary axis between all of its poses, with a '
-                'feed, or none between any'
-            )
-    elif plan.kind is Kind.DYNAMIC and not plan.feed > 0.0:
-        raise UserError(f'{where}: a dynamic cycle has a feed')
-    for column, name in enumerate(plan.axes):
-        if name == SPINDLE:
-            continue
-        if name not in axes:
-            raise UserError(
-                f'{where}: no axis {name} in the machine, expected {sorted(axes)} or {SPINDLE}'
-            )
-        values, slack = plan.commands[:, column], 1e-9
-        axis = axes[name]
-        outside = np.flatnonzero((values < axis.lower - slack) | (values > axis.upper + slack))
-        if outside.size:
-            raise UserError(
-                f'{where}: pose {outside[0]}: {name} = {values[outside[0]]:.6g} is outside '
-                f'{axis.lower:.6g} to {axis.upper:.6g} (m or rad)'
-            )
+        period = self.truth.warming.period
+        complete = (self.now - self.epoch) // period
+        times = self.epoch + (np.arange(self._temperature, complete) + 1) * period
+        temperatures += self._thermometers.read(times, self._warm_for(times))
+        self._temperature = complete

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+
+import numpy as np
 
 from rtest_drivers.sim.fields import Fields
 from rtest_estimation.errors import UserError
@@ -78,14 +80,44 @@ def parse_faults(fields: Fields, gauges: int) -> tuple[Fault, ...]:
 def timed(faults: Iterable[Fault], epoch: int) -> list[Window]:
     """The faults given by seconds since `epoch` [ns]."""
     return [
-        window(fault, epoch + round(fault.start * 1e9), 0)
+        _window(fault, epoch + round(fault.start * 1e9), 0)
         for fault in faults
         if fault.start is not None
     ]
 
 
-def window(fault: Fault, start: int, end: int) -> Window:
+def of_cycle(
+    faults: Iterable[Fault],
+    cycle: str,
+    poses: Mapping[int, tuple[int, int]],
+    whole: tuple[int, int],
+) -> list[Window]:
+    """The faults of a cycle. poses : begin and end of their dwells; whole : of the cycle [ns]."""
+    return [
+        _window(fault, *(poses[fault.pose] if fault.pose is not None else whole))
+        for fault in faults
+        if fault.cycle == cycle and (fault.pose is None or fault.pose in poses)
+    ]
+
+
+def skipped_poses(faults: Iterable[Fault], cycle: str) -> set[int]:
+    """Poses of a cycle to which the machine does not go."""
+    return {
+        fault.pose for fault in faults if fault.kind == 'pose_skipped' and fault.cycle == cycle
+    }
+
+
+def _window(fault: Fault, start: int, end: int) -> Window:
     """From `start` for the fault's own duration, or up to `end` where it has none [ns]."""
     if fault.duration is not None:
         end = start + round(fault.duration * 1e9)
     return Window(fault, start, end)
+
+
+def active(windows: Iterable[Window], kind: str, times: np.ndarray) -> np.ndarray:
+    """Whether a fault of this kind is on at `times` (n,) [ns]."""
+    on = np.zeros(len(times), dtype=bool)
+    for item in windows:
+        if item.fault.kind == kind:
+            on |= (times >= item.start) & (times < item.end)
+    return on

@@ -94,6 +94,15 @@ def table_to_spindle(machine: Machine, positions: np.ndarray) -> np.ndarray:
     return np.swapaxes(tool, 1, 2) @ table
 
 
+def table_to_sphere(machine: Machine, positions: np.ndarray) -> np.ndarray:
+    """(n, 3, 3) nominal rotations from the table to the sphere, which turns with the spindle.
+
+    positions : (n, k + 1) in the order of ``machine.letters``, then the spindle [m] or [rad]
+    """
+    spindle = turn(_Z, -positions[:, -1])[:, :3, :3]
+    return spindle @ table_to_spindle(machine, positions[:, :-1])
+
+
 def _side(
     machine: Machine,
     names: tuple[str, ...],

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
+from rtest_drivers.sim.encoders import Encoders
 from rtest_drivers.sim.errors import GeometricErrors, parse_errors
 from rtest_drivers.sim.faults import Fault, parse_faults
 from rtest_drivers.sim.fields import Fields, read_yaml
@@ -26,17 +27,6 @@ from rtest_estimation.errors import UserError
 from rtest_identification.machine import Machine, load_machine
 
 _UM, _MS, _DEG, _MM = 1e-6, 1e-3, math.pi / 180.0, 1e-3
-
-
-@dataclass(frozen=True)
-class Encoders:
-    """Encoder feedback: period [ns]; of linear [m] and rotary axes [rad] white noise and steps."""
-
-    period: int
-    linear_noise: float
-    rotary_noise: float
-    linear_step: float = 0.0
-    rotary_step: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -24,6 +24,7 @@ import numpy as np
 from rtest_drivers.sim.errors import COMPONENTS, GeometricErrors, amplitude, known_symbol, split
 from rtest_drivers.sim.fields import Fields, number
 from rtest_estimation.errors import UserError
+from rtest_estimation.records import Temperature
 from rtest_identification.machine import Machine
 
 _MINUTE = 60.0
@@ -65,6 +66,31 @@ class Warming:
             values += one.rise * (now - share) * -np.expm1(-since / one.lag)
             share = now
         return values
+
+
+class Thermometers:
+    """The sensors, read in order of time: every temperature draws its noise.
+
+    noise : where the numbers come from
+    """
+
+    def __init__(self, warming: Warming, noise: np.random.Generator) -> None:
+        self._warming, self._random = warming, noise
+
+    def read(self, times: np.ndarray, seconds: np.ndarray) -> list[Temperature]:
+        """The next temperatures, of all sensors at one time after the other.
+
+        times : (n,) [ns]; seconds : (n,) since the heat began
+        """
+        warming = self._warming
+        values = warming.noise * self._random.standard_normal((len(times), len(warming.sensors)))
+        for column, sensor in enumerate(warming.sensors.values()):
+            values[:, column] += warming.value(sensor, seconds)
+        return [
+            Temperature(int(time), name, float(value), warming.noise**2)
+            for time, row in zip(times, values, strict=True)
+            for name, value in zip(warming.sensors, row, strict=True)
+        ]
 
 
 @dataclass(frozen=True)
