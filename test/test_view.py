@@ -228,6 +228,53 @@ def test_a_device_that_hangs_is_shown_and_so_is_its_return(graph) -> None:
     page.wait_for_selector('[data-device=gauges][data-level=ok]')
 
 
+def buttons(page) -> list[tuple[bool, str]]:
+    """Whether each button of the footer is off, and its reason."""
+    return [
+        (one.is_disabled(), one.get_attribute('title') or '')
+        for one in page.locator('footer button').all()
+    ]
+
+
+def test_without_a_connection_the_buttons_are_off_and_say_why(graph) -> None:
+    page, pid = graph.page, graph.pid('view')
+    assert {off for off, _ in buttons(page)} == {False}
+    os.kill(pid, signal.SIGSTOP)
+    try:
+        page.wait_for_selector('body.lost')
+        page.wait_for_selector('[data-wish=start]:disabled')
+        (state,) = set(buttons(page))
+        assert state[0] and 'No connection' in state[1]
+        assert 'No connection' in page.inner_text('footer')
+    finally:
+        os.kill(pid, signal.SIGCONT)
+    page.wait_for_selector('[data-wish=start]:enabled')
+    assert set(buttons(page)) == {(False, '')}
+    assert 'No connection' not in page.inner_text('footer')
+
+
+@pytest.mark.parametrize(('key', 'why'), [('guessed', 'controls are off'), ('', 'Looking only')])
+def test_without_the_key_the_buttons_stay_off(graph, key, why) -> None:
+    other = graph.page.context.browser.new_page()
+
+    def another_key(route) -> None:
+        answer = route.fetch()
+        text = re.sub('(name="rtest-key" content=").*?"', rf'\g<1>{key}"', answer.text())
+        route.fulfill(response=answer, body=text)
+
+    other.route(graph.address, another_key)
+    other.goto(graph.address)
+    other.wait_for_selector("#link:has-text('LIVE')", timeout=PATIENCE)
+    if key:
+        other.click('[data-wish=start]')
+        other.wait_for_selector("#answer:has-text('Refused: controls are off')")
+    # The connection is there all the time.
+    other.wait_for_timeout(1000)
+    (state,) = set(buttons(other))
+    assert state[0] and why in state[1] and why in other.inner_text('footer')
+    other.close()
+
+
 def connections(node) -> dict[str, tuple[int, int]]:
     """Publishers and subscriptions of every topic."""
     return {
@@ -314,7 +361,22 @@ def test_the_session_ended_from_the_page_is_closed_and_holds_the_mark(graph) -> 
     assert any('not measured: 2b-nest, 2b-static' in line for line in said)
     graph.page.wait_for_selector("#link:has-text('NO CONNECTION')")
     graph.page.wait_for_selector('body.lost')
+    graph.page.wait_for_selector('[data-wish=start]:disabled')
+    assert {off for off, _ in buttons(graph.page)} == {True}
     assert graph.page.is_visible("#warnings li:has-text('run-out')")
     bag = read_bag(graph.folder / 'out' / 'short', ['std_msgs/msg/String'])
     assert bag.closed
     assert [mark.data for mark in bag.messages('/rtest/mark')] == ['door opened']
+    # What the page last showed of the model is what was recorded.
+    (gap,) = bag.messages('/rtest/model_gap')
+    assert graph.page.inner_text('#gap .badge') == gap.verdict
+    shown = graph.page.locator('#gap').inner_text()
+    for key in gap.effects:
+        assert key in shown
+    told = [
+        {pair.key: pair.value for pair in one.values}
+        for message in bag.messages('/diagnostics') for one in message.status
+        if one.name == 'identifier: model gap'
+    ][-1]
+    for text in told.values():
+        assert text.strip() in shown
