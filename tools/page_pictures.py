@@ -21,7 +21,7 @@ from rtest_drivers.domain import free_domain
 
 PICTURES = Path(__file__).resolve().parents[1] / 'docs' / 'pictures'
 # A tablet, held across [px].
-SIZE = {'width': 1180, 'height': 820}
+SIZE = {'width': 1280, 'height': 900}
 # For one thing to happen [ms]; the end of the session [s].
 PATIENCE, END_S = 180_000, 60
 LARGEST_BYTES = 300_000
@@ -39,7 +39,7 @@ setups:
   1b: {{sphere_mm: [0, -90.0, 140.6]}}
   2b: {{sphere_mm: [0, 0, 140.6]}}
 """
-# Simulated seconds: the gauges are silent for six of the watch's, at ten a second.
+# The gauges are silent for 60 simulated seconds, which are six of the watch's.
 FAULTS = """
 faults:
   - {kind: gauge_silent, cycle: 1a-static, pose: 72, for_s: 60}
@@ -123,10 +123,12 @@ def pictures(page, folder):
     measure(page, '1b-nest')
     measure(page, '1b-static')
     start(page, '2b-nest')
+    page.wait_for_selector("#doing:has-text('measuring 2b-nest')")
     page.click("#cycles button:has-text('1b-static')")
     yield take(page, folder, 'poses', 'poses-card')
     measure(page, '2b-static')
-    page.wait_for_selector('#gap .badge')
+    # What the identifier says of its verdict comes after it.
+    page.wait_for_selector('#gap .badge.ok, #gap li')
     yield take(page, folder, 'results', 'picture-card')
 
 

@@ -4,11 +4,13 @@ import {byId, set} from './dom.js';
 const KEY = document.querySelector('meta[name=rtest-key]').content || location.hash.slice(1);
 const NO_CONNECTION = 'No connection to the server: buttons are off until it is back.';
 const SURE_MS = 4000;
+// An answer that stays looks like the state of the session [ms].
+const ANSWER_MS = 20_000;
 
 // Why buttons are off for good, '' where they are not.
 let off = KEY ? '' :
   'Looking only: buttons need the address with its key, as rtest view printed it.';
-let connected = false;
+let connected = false, fading;
 
 export function startControls() {
   for (const button of document.querySelectorAll('[data-wish]')) {
@@ -38,6 +40,8 @@ export function permit(there) {
 
 function say(text, level) {
   set(byId('answer'), text, level);
+  clearTimeout(fading);
+  if (level) fading = setTimeout(() => say('', ''), ANSWER_MS);
 }
 
 async function post(path, body) {
