@@ -350,6 +350,37 @@ def test_results_and_missing_poses_are_shown(graph, topics) -> None:
     )
 
 
+def test_what_is_said_of_an_effect_stands_below_it(graph) -> None:
+    page = graph.page.context.browser.new_page()
+    page.goto(graph.address)
+    page.wait_for_selector('#location tbody tr', timeout=PATIENCE)
+    page.evaluate("""async () => {
+        const {cell} = await import('/connection.js'), {drawResults} = await import('/results.js');
+        cell.parts.gap = {
+            verdict: 'partly explained', noise: 0.3, before: 2.5, after: 0.9, effects: [
+                {key: 'angle/CX', confidence: 0.93, rivals: ''},
+                {key: 'scale/Y', confidence: 0.991, rivals: 'scale/B'},
+            ],
+        };
+        cell.parts.gap_notes = [
+            'angle/CX: yaw of X; E_C(X)X = a x', '  a = 12.3 ± 0.4 µrad/m (k = 2)',
+            '  confidence 0.93', 'unexplained at B = -40.0 deg: rms 2.10 µm',
+        ];
+        drawResults();
+    }""")
+    assert page.inner_text('#gap .badge.warn') == 'partly explained'
+    # An effect without words is named all the same.
+    assert [
+        [line for line in text.split('\n') if line]
+        for text in page.locator('#gap li').all_inner_texts()
+    ] == [
+        ['scale/Y (99 % sure; cannot be told from scale/B)'],
+        ['angle/CX: yaw of X; E_C(X)X = a x', 'a = 12.3 ± 0.4 µrad/m (k = 2)', 'confidence 0.93'],
+        ['unexplained at B = -40.0 deg: rms 2.10 µm'],
+    ]
+    page.close()
+
+
 def test_the_session_ended_from_the_page_is_closed_and_holds_the_mark(graph) -> None:
     graph.page.wait_for_selector("#doing:has-text('2b-nest waits')")
     assert 'Done' in graph.tap('abort')
