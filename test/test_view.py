@@ -228,6 +228,53 @@ def test_a_device_that_hangs_is_shown_and_so_is_its_return(graph) -> None:
     page.wait_for_selector('[data-device=gauges][data-level=ok]')
 
 
+def buttons(page) -> list[tuple[bool, str]]:
+    """Whether each button of the footer is off, and its reason."""
+    return [
+        (one.is_disabled(), one.get_attribute('title') or '')
+        for one in page.locator('footer button').all()
+    ]
+
+
+def test_without_a_connection_the_buttons_are_off_and_say_why(graph) -> None:
+    page, pid = graph.page, graph.pid('view')
+    assert {off for off, _ in buttons(page)} == {False}
+    os.kill(pid, signal.SIGSTOP)
+    try:
+        page.wait_for_selector('body.lost')
+        page.wait_for_selector('[data-wish=start]:disabled')
+        (state,) = set(buttons(page))
+        assert state[0] and 'No connection' in state[1]
+        assert 'No connection' in page.inner_text('footer')
+    finally:
+        os.kill(pid, signal.SIGCONT)
+    page.wait_for_selector('[data-wish=start]:enabled')
+    assert set(buttons(page)) == {(False, '')}
+    assert 'No connection' not in page.inner_text('footer')
+
+
+@pytest.mark.parametrize(('key', 'why'), [('guessed', 'controls are off'), ('', 'Looking only')])
+def test_without_the_key_the_buttons_stay_off(graph, key, why) -> None:
+    other = graph.page.context.browser.new_page()
+
+    def another_key(route) -> None:
+        answer = route.fetch()
+        text = re.sub('(name="rtest-key" content=").*?"', rf'\g<1>{key}"', answer.text())
+        route.fulfill(response=answer, body=text)
+
+    other.route(graph.address, another_key)
+    other.goto(graph.address)
+    other.wait_for_selector("#link:has-text('LIVE')", timeout=PATIENCE)
+    if key:
+        other.click('[data-wish=start]')
+        other.wait_for_selector("#answer:has-text('Refused: controls are off')")
+    # The connection is there all the time.
+    other.wait_for_timeout(1000)
+    (state,) = set(buttons(other))
+    assert state[0] and why in state[1] and why in other.inner_text('footer')
+    other.close()
+
+
 def connections(node) -> dict[str, tuple[int, int]]:
     """Publishers and subscriptions of every topic."""
     return {
@@ -303,6 +350,37 @@ def test_results_and_missing_poses_are_shown(graph, topics) -> None:
     )
 
 
+def test_what_is_said_of_an_effect_stands_below_it(graph) -> None:
+    page = graph.page.context.browser.new_page()
+    page.goto(graph.address)
+    page.wait_for_selector('#location tbody tr', timeout=PATIENCE)
+    page.evaluate("""async () => {
+        const {cell} = await import('/connection.js'), {drawResults} = await import('/results.js');
+        cell.parts.gap = {
+            verdict: 'partly explained', noise: 0.3, before: 2.5, after: 0.9, effects: [
+                {key: 'angle/CX', confidence: 0.93, rivals: ''},
+                {key: 'scale/Y', confidence: 0.991, rivals: 'scale/B'},
+            ],
+        };
+        cell.parts.gap_notes = [
+            'angle/CX: yaw of X; E_C(X)X = a x', '  a = 12.3 ± 0.4 µrad/m (k = 2)',
+            '  confidence 0.93', 'unexplained at B = -40.0 deg: rms 2.10 µm',
+        ];
+        drawResults();
+    }""")
+    assert page.inner_text('#gap .badge.warn') == 'partly explained'
+    # An effect without words is named all the same.
+    assert [
+        [line for line in text.split('\n') if line]
+        for text in page.locator('#gap li').all_inner_texts()
+    ] == [
+        ['scale/Y (99 % sure; cannot be told from scale/B)'],
+        ['angle/CX: yaw of X; E_C(X)X = a x', 'a = 12.3 ± 0.4 µrad/m (k = 2)', 'confidence 0.93'],
+        ['unexplained at B = -40.0 deg: rms 2.10 µm'],
+    ]
+    page.close()
+
+
 def test_the_session_ended_from_the_page_is_closed_and_holds_the_mark(graph) -> None:
     graph.page.wait_for_selector("#doing:has-text('2b-nest waits')")
     assert 'Done' in graph.tap('abort')
@@ -314,7 +392,22 @@ def test_the_session_ended_from_the_page_is_closed_and_holds_the_mark(graph) -> 
     assert any('not measured: 2b-nest, 2b-static' in line for line in said)
     graph.page.wait_for_selector("#link:has-text('NO CONNECTION')")
     graph.page.wait_for_selector('body.lost')
+    graph.page.wait_for_selector('[data-wish=start]:disabled')
+    assert {off for off, _ in buttons(graph.page)} == {True}
     assert graph.page.is_visible("#warnings li:has-text('run-out')")
     bag = read_bag(graph.folder / 'out' / 'short', ['std_msgs/msg/String'])
     assert bag.closed
     assert [mark.data for mark in bag.messages('/rtest/mark')] == ['door opened']
+    # What the page last showed of the model is what was recorded.
+    (gap,) = bag.messages('/rtest/model_gap')
+    assert graph.page.inner_text('#gap .badge') == gap.verdict
+    assert [key for key in gap.effects if key not in graph.page.inner_text('#gap')] == []
+    told = [
+        [pair.value for pair in one.values if pair.key.startswith('note ')]
+        for message in bag.messages('/diagnostics') for one in message.status
+        if one.name == 'identifier: model gap'
+    ][-1]
+    items = graph.page.locator('#gap li').all_inner_texts()
+    assert [line for text in items for line in text.split('\n') if line] == [
+        text.strip() for text in told
+    ]

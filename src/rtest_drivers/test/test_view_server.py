@@ -1,15 +1,20 @@
 """The web server of the page: who may ask, what is refused, what is sent."""
 
 import asyncio
+import ipaddress
 import json
+import re
 import socket
+from importlib.resources import files
+from urllib.parse import urlsplit
 
 import pytest
 from aiohttp.test_utils import TestClient, TestServer
 
 from rtest_drivers.cli import main
+from rtest_drivers.view.address import is_local, named_hosts, own_addresses, page_address
 from rtest_drivers.view.devices import Report
-from rtest_drivers.view.server import KEY_HEADER, Server, address, is_local
+from rtest_drivers.view.server import KEY_HEADER, Server, serve
 from rtest_drivers.view.state import CellState
 
 
@@ -63,6 +68,25 @@ def test_the_page_comes_with_its_key_and_from_nowhere_else() -> None:
     assert cell.server.key in texts[0]
     assert "default-src 'self'" in headers['Content-Security-Policy']
     assert not any('http://' in text or 'https://' in text for text in texts)
+
+
+def test_every_module_that_the_page_imports_is_served() -> None:
+    async def test(client):
+        found, seen = ['page.js'], {}
+        while found:
+            name = found.pop()
+            answer = await client.get(f'/{name}')
+            seen[name] = answer.status, answer.content_type, await answer.text()
+            found += set(re.findall(r"from '\./(\w+\.js)'", seen[name][2])) - seen.keys()
+        return seen, (await client.get('/page.html')).status
+
+    seen, page = Cell().run(test)
+    assert {(status, kind) for status, kind, _ in seen.values()} == {(200, 'text/javascript')}
+    static = files('rtest_drivers.view') / 'static'
+    assert set(seen) == {one.name for one in static.iterdir() if one.name.endswith('.js')}
+    assert not any('http://' in text or 'https://' in text for _, _, text in seen.values())
+    # Only the page itself, with its key.
+    assert page == 404
 
 
 def test_a_wish_goes_to_the_session_and_its_answer_back() -> None:
@@ -147,10 +171,34 @@ def test_elsewhere_the_page_does_not_hold_the_key_but_the_address_does() -> None
         return await (await client.get('/', headers={'Host': '192.0.2.7:8090'})).text()
 
     assert cell.server.key not in cell.run(test)
-    assert address(cell.server, 8090).endswith(f':8090/#{cell.server.key}')
     assert [is_local(host) for host in ('127.0.0.1', '::1', 'localhost', '0.0.0.0', 'box')] == [
         True, True, True, False, False
     ]
+
+
+def test_bound_everywhere_the_page_is_named_and_numbered() -> None:
+    assert page_address('cell', 8090, 'secret') == 'http://cell:8090/#secret'
+    assert page_address('::1', 8090) == 'http://[::1]:8090/'
+    assert named_hosts('127.0.0.1') == ['127.0.0.1']
+    assert named_hosts('::') == [socket.gethostname()]
+    name, *numbers = named_hosts('0.0.0.0')
+    assert name == socket.gethostname() and numbers == own_addresses()
+    for number in map(ipaddress.IPv4Address, numbers):
+        assert not number.is_loopback
+        # It is this computer's own: something can be bound to it.
+        socket.create_server((str(number), 0)).close()
+
+
+@pytest.mark.parametrize('host', ['127.0.0.1', '0.0.0.0'])
+def test_every_address_is_printed_with_the_key_where_the_page_has_none(host, capsys) -> None:
+    cell, stop = Cell(host), asyncio.Event()
+    stop.set()
+    asyncio.run(serve(cell.server, 0, stop))
+    printed = capsys.readouterr().out.splitlines()
+    assert [line.partition(': ')[0] for line in printed] == ['page'] * len(named_hosts(host))
+    addresses = [urlsplit(line.partition(': ')[2]) for line in printed]
+    assert [one.hostname for one in addresses] == [one.lower() for one in named_hosts(host)]
+    assert {one.fragment for one in addresses} == {'' if host == '127.0.0.1' else cell.server.key}
 
 
 @pytest.mark.parametrize(

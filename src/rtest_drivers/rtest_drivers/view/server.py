@@ -17,11 +17,13 @@ import socket
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable
 from importlib.resources import files
+from pathlib import PurePosixPath
 from typing import Any
 from urllib.parse import urlsplit
 
 from aiohttp import web
 
+from rtest_drivers.view.address import is_local, named_hosts, page_address
 from rtest_drivers.view.state import TICK_S, CellState
 from rtest_estimation.errors import UserError
 
@@ -29,7 +31,7 @@ KEY_HEADER = 'X-Rtest-Key'
 MARK_LIMIT = 200
 # What a person can ask of a session, as services `session/NAME`.
 WISHES = ('start', 'repeat', 'skip', 'calibrate', 'abort')
-_TYPES = {'page.js': 'text/javascript', 'page.css': 'text/css', 'page.html': 'text/html'}
+_TYPES = {'.js': 'text/javascript', '.css': 'text/css'}
 _HEADERS = {
     'Content-Security-Policy':
         "default-src 'self'; img-src data:; frame-ancestors 'none'; base-uri 'none'",
@@ -58,7 +60,12 @@ class Server:
         self._live = 'null'
         self._ticked = asyncio.Condition()
         static = files('rtest_drivers.view') / 'static'
-        self._files = {name: (static / name).read_text(encoding='utf-8') for name in _TYPES}
+        self._html = (static / 'page.html').read_text(encoding='utf-8')
+        # Read once: no request names a file that is opened.
+        self._files = {
+            one.name: one.read_text(encoding='utf-8') for one in static.iterdir()
+            if PurePosixPath(one.name).suffix in _TYPES
+        }
 
     @property
     def local(self) -> bool:
@@ -69,8 +76,8 @@ class Server:
         """The application, with the task that ticks."""
         application = web.Application(middlewares=[self._guard], client_max_size=_LARGEST)
         application.router.add_get('/', self._page)
-        application.router.add_get('/page.js', self._file)
-        application.router.add_get('/page.css', self._file)
+        for name in self._files:
+            application.router.add_get(f'/{name}', self._file)
         application.router.add_get('/events', self._events)
         application.router.add_post('/ask', self._on_ask)
         application.router.add_post('/mark', self._on_mark)
@@ -137,12 +144,14 @@ class Server:
 
     async def _page(self, _: web.Request) -> web.Response:
         key = self.key if self.local else ''
-        text = self._files['page.html'].replace('KEY', key)
+        text = self._html.replace('KEY', key)
         return web.Response(text=text, content_type='text/html')
 
     async def _file(self, request: web.Request) -> web.Response:
         name = request.path.lstrip('/')
-        return web.Response(text=self._files[name], content_type=_TYPES[name])
+        return web.Response(
+            text=self._files[name], content_type=_TYPES[PurePosixPath(name).suffix]
+        )
 
     async def _events(self, request: web.Request) -> web.StreamResponse:
         """The history, then ten times a second what is, and each part when it has changed.
@@ -204,27 +213,12 @@ async def serve(server: Server, port: int, stop: asyncio.Event) -> None:
                 f'{server.host}:{port}: cannot be served: {error.strerror}; choose another '
                 '--port or --host'
             ) from None
-        print(f'page: {address(server, runner.addresses[0][1])}', flush=True)
+        bound, key = runner.addresses[0][1], '' if server.local else server.key
+        for host in named_hosts(server.host):
+            print(f'page: {page_address(host, bound, key)}', flush=True)
         await stop.wait()
     finally:
         await runner.cleanup()
-
-
-def address(server: Server, port: int) -> str:
-    """What to open; with the key where the page does not hold it."""
-    host = server.host
-    if host in ('0.0.0.0', '::'):
-        host = socket.gethostname()
-    host = f'[{host}]' if ':' in host else host
-    return f'http://{host}:{port}/' + ('' if server.local else f'#{server.key}')
-
-
-def is_local(host: str) -> bool:
-    """Whether an address to bind to is this host's own."""
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host.lower() == 'localhost'
 
 
 def _netloc(origin: str) -> str | None:

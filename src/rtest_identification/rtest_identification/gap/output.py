@@ -173,7 +173,9 @@ def lines(result: GapResult) -> list[str]:
 def where(place: Place) -> str:
     """A place for a person: degrees, seconds, words."""
     if isinstance(place.value, str):
-        return f'{place.by} {place.value}'
+        # 'component, table frame' and 'X': component X, table frame.
+        kind, comma, frame = place.by.partition(', ')
+        return f'{kind} {place.value}{comma}{frame}'
     if place.by.startswith('direction of'):
         return f'{place.by} {"+" if place.value > 0 else "-"}'
     if place.by == 'time':
