@@ -73,6 +73,7 @@ class GraphSettings:
     simulate : truth file of the simulated cell; None for real devices
     devices : of the session file, for the drivers that are to be started; not used with `simulate`
     thermal : whether the session repeats a cycle while the machine warms up
+    checks : whether it checks the measuring chain, and identifies nothing
     rate : simulated seconds per second of wall time
     namespace : of every node and topic, empty for none
     remaps : rules ``from:=to`` for every node
@@ -90,6 +91,7 @@ class GraphSettings:
     sphere_radius: float = 0.0127
     nest: str = 'contact'
     thermal: bool = False
+    checks: bool = False
     rate: float = 1.0
     namespace: str = ''
     remaps: tuple[str, ...] = ()
@@ -120,7 +122,7 @@ class GraphSettings:
         """With what the session file says."""
         return replace(
             self, sphere_radius=session.sphere_radius, nest=session.nest.name.lower(),
-            devices=session.devices, thermal=session.every > 0.0,
+            devices=session.devices, thermal=session.every > 0.0, checks=session.checks,
         )
 
     @property
@@ -183,7 +185,7 @@ def session_nodes(settings: GraphSettings) -> tuple[GraphNode, ...]:
                 'sphere_radius_mm': settings.sphere_radius * 1e3, 'nest': settings.nest, **clock,
             },
         ),
-        _identifier(settings, clock),
+        *_identifier(settings, clock),
     ]
     if simulated:
         nodes += [
@@ -249,13 +251,16 @@ def frames_node(clock: Mapping[str, ParameterValue]) -> GraphNode:
     return GraphNode('frames', 'rtest_drivers', dict(clock), optional=True)
 
 
-def _identifier(settings: GraphSettings, clock: dict[str, ParameterValue]) -> GraphNode:
-    """Who makes errors of finished cycles."""
+def _identifier(
+    settings: GraphSettings, clock: dict[str, ParameterValue]
+) -> tuple[GraphNode, ...]:
+    """Who makes errors of finished cycles; nobody where only the chain is checked."""
+    if settings.checks:
+        return ()
     if settings.thermal:
-        return GraphNode(
-            'thermal', 'rtest_identification', {'out': str(settings.folder / 'thermal'), **clock}
-        )
-    return GraphNode('identifier', 'rtest_identification', clock)
+        out = {'out': str(settings.folder / 'thermal')}
+        return (GraphNode('thermal', 'rtest_identification', {**out, **clock}),)
+    return (GraphNode('identifier', 'rtest_identification', clock),)
 
 
 def ros_arguments(node: GraphNode, namespace: str = '', remaps: tuple[str, ...] = ()) -> list[str]:

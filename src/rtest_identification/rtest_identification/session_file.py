@@ -107,6 +107,11 @@ class SessionConfig:
         """How often the last of them is there."""
         return len(self.plans) - len(self.distinct) + 1
 
+    @property
+    def checks(self) -> bool:
+        """Whether the session checks the measuring chain and identifies nothing."""
+        return self.kind == CHECK
+
     def reads_temperatures(self, simulated: bool) -> bool:
         """Whether the session starts the thermometer driver and needs it."""
         return self.kind == THERMAL if simulated else 'thermometers' in self.devices

@@ -120,10 +120,9 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _is_chain(path: Path, check: str) -> bool:
     """Whether the whole chain is to be checked: the file has the cycles for it."""
-    from rtest_identification.session_cycle import CHECK
     from rtest_identification.session_file import load_session
 
-    return check == CHAIN and load_session(path).kind == CHECK
+    return check == CHAIN and load_session(path).checks
 
 
 def _check(path: Path, arguments: argparse.Namespace) -> bool:

@@ -87,7 +87,7 @@ class SessionNode(Node):
         drivers = (*DRIVERS, *more)
         # Closed in this order: what the earlier one publishes last, the later one still needs.
         identifier = 'thermal' if self.config.every else 'identifier'
-        finishers = ('estimator', identifier, 'recorder')
+        finishers = ('estimator', *(() if self.config.checks else (identifier,)), 'recorder')
         # As the drivers' stamps, so that a clock that is set does not part plan and readings.
         self._host = HostClock()
 
