@@ -66,17 +66,20 @@ def find_dwells(
     positions: np.ndarray,
     rules: DwellRules | None = None,
     until: int | None = None,
+    readings: int | None = None,
 ) -> tuple[list[Dwell], list[Missing]]:
     """Match the stretches in which every axis stood still to the poses of the plan, in order.
 
     Of a stop that is longer than planned the last part is used, the most settled one; of the last
     stop the first part, so that the result does not depend on how long the machine waits there.
+    Where the data end in a stop before the plan's last one, its last part with readings is used.
 
     Parameters
     ----------
     stamps : (n,) int64, strictly increasing [ns]
     positions : (n, axes) in the order of ``plan.axes``; NaN where the feedback has no such axis
     until : when the cycle ended [ns]; the last feedback where it is not known
+    readings : the last gauge reading [ns]; as until the last feedback where it is not known
 
     Returns
     -------
@@ -110,12 +113,15 @@ def find_dwells(
             continue
         number, place = matched[row]
         first, last = runs[number]
-        arrived = int(stamps[first])
+        arrived, left = int(stamps[first]), int(stamps[last])
         if number != last_run:
-            arrived = max(arrived, int(stamps[last]) - shared[number] * planned)
+            length = shared[number] * planned
+            if number == len(runs) - 1 and readings is not None and readings >= arrived + length:
+                left = min(left, readings)
+            arrived = max(arrived, left - length)
         arrived += place * planned
         start = arrived + int(rules.settle * 1e9)
-        end = min(int(stamps[last]), arrived + planned)
+        end = min(left, arrived + planned)
         if end - arrived < planned // 2 or end <= start:
             stood = max(end - arrived, 0) / 1e9
             reason = f'not settled: stood still {stood:.2f} s of {plan.dwell:.2f} s'

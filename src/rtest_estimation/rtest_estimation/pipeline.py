@@ -38,6 +38,8 @@ from rtest_estimation.records import (
 KEEP_BEFORE_NS = 10_000_000_000
 # The end of a cycle waits for gauge readings up to it, until the feedback is this far ahead.
 GAUGE_PATIENCE_NS = 2_000_000_000
+# Feedback that ends by more before the readings has failed; less is how a session ends.
+_STOPPED_NS = 5_000_000_000
 # A dwell mean scattered more than this is vibration or a machine still moving [m].
 MAX_SCATTER = 20e-6
 
@@ -152,7 +154,10 @@ class Estimator:
             if ready is None:
                 plan = self._plans[0]
                 limit = self._plans[1].stamp if len(self._plans) > 1 else None
-                last = max(self._feedback.last, self._gauges.last, plan.stamp)
+                last = max(self._feedback.last, plan.stamp)
+                # At the end of a session the drivers stop one a little before the other.
+                if self._gauges.last - last > _STOPPED_NS:
+                    last = self._gauges.last
                 ready = self._close(plan, last if limit is None else limit)
             done.append(ready)
         return done
@@ -194,7 +199,8 @@ class Estimator:
             rest = range(came, len(plan.commands))
             missing = tuple(Missing(row, 'never reached') for row in rest)
             return Finished(Cycle(plan, (), missing, '', end))
-        dwells, missing = find_dwells(plan, stamps, positions, self.rules.dwell, end)
+        newest = int(times[-1]) if len(times) else None
+        dwells, missing = find_dwells(plan, stamps, positions, self.rules.dwell, end, newest)
         data = (times, displacement, status)
         if plan.kind is Kind.NEST_CALIBRATION:
             return self._calibrate(plan, dwells, missing, data, end)

@@ -237,6 +237,49 @@ def test_a_cycle_that_is_never_finished_ends_when_the_next_begins():
     assert not done[3].cycle.missing
 
 
+def standing_at_the_end(plan):
+    """A session whose last cycle carries out `plan` and stays where it ends for 20 s."""
+    nest = run([session()[0]])
+    static = run([plan], wait=20.0, seed=1)
+    return [*nest[0], *static[0]], [*nest[1], *static[1]]
+
+
+@pytest.mark.parametrize('gauges_s', [-2.0, -0.4, 0.0])
+@pytest.mark.parametrize('feedback_s', [-2.0, -0.4, 0.0])
+def test_drivers_that_stop_one_after_the_other_cost_no_pose(gauges_s, feedback_s):
+    """The last pose never comes; the machine stands at the one before until the session ends."""
+    plans = session()
+    driven = replace(plans[1], commands=plans[1].commands[:-1])
+    feedback, blocks = standing_at_the_end(driven)
+    end = feedback[-1].stamp
+    feedback = [f for f in feedback if f.stamp <= end + feedback_s * 1e9]
+    blocks = [b for b in blocks if b.stamp <= end + gauges_s * 1e9]
+    cycle = estimate(plans, feedback, blocks)[1].cycle
+    assert [p.index for p in cycle.points] == [0, 1, 2, 3, 4]
+    assert [(m.index, m.reason) for m in cycle.missing] == [(5, 'never reached')]
+    assert cycle.points[-1].readings >= 10
+
+
+def test_gauges_that_fail_before_a_pose_are_its_reason_also_at_the_end():
+    plans = session()
+    driven = replace(plans[1], commands=plans[1].commands[:-1])
+    feedback, blocks = standing_at_the_end(driven)
+    # Pose 4 is reached after four dwells and moves of 0.3 s each, and a reading is missing.
+    blocks = [b for b in blocks if b.stamp < plans[1].stamp + 2_300_000_000]
+    cycle = estimate(plans, feedback, blocks)[1].cycle
+    reasons = {m.index: m.reason for m in cycle.missing}
+    assert reasons[4] == 'no gauge readings' and reasons[5] == 'never reached'
+
+
+def test_feedback_that_fails_long_before_the_readings_is_stale():
+    plans = session()
+    feedback, blocks = standing_at_the_end(plans[1])
+    feedback = [f for f in feedback if f.stamp < plans[1].stamp + 1_700_000_000]
+    cycle = estimate(plans, feedback, blocks)[1].cycle
+    assert all('stale' in m.reason for m in cycle.missing)
+    assert {m.index for m in cycle.missing} == {3, 4, 5}
+
+
 def test_without_a_calibration_every_pose_is_missing_for_that_reason():
     plan = static_plan(T0)
     done = estimate([plan], *run([plan]))
