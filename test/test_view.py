@@ -336,6 +336,8 @@ def test_results_and_missing_poses_are_shown(graph, topics) -> None:
         assert figure(shown) == pytest.approx(1e6 * value, abs=0.0051)
     cycle = topics.next('cycle', lambda message: message.plan.cycle == '1a-static')
     assert list(cycle.missing) == [4]
+    # The reason comes on a topic of its own.
+    page.wait_for_selector("#missing li:not(:text-matches(': missing$'))")
     missing = page.inner_text('#missing')
     assert missing.startswith('Pose 4 (') and ': ' in missing and not missing.endswith('missing')
     assert page.locator('#poses button.missing').count() == 1
