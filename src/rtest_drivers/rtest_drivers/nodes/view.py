@@ -52,6 +52,9 @@ _LOSSY = QoSProfile(
     reliability=ReliabilityPolicy.BEST_EFFORT,
     durability=DurabilityPolicy.VOLATILE,
 )
+# Few, and some are said once: why a pose is missing. Their publishers keep the last ones only, and
+# wait for nobody either.
+_SAID = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=200)
 
 
 class ViewNode(Node):
@@ -69,7 +72,7 @@ class ViewNode(Node):
         self._listen(JointState, 'rtest/cnc/feedback', self._on_feedback)
         self._listen(PointStamped, 'rtest/sphere_centre', self._on_centre)
         self._listen(Temperature, 'rtest/temperature', self._on_temperatures)
-        self._listen(DiagnosticArray, '/diagnostics', self._on_diagnostics)
+        self._listen(DiagnosticArray, '/diagnostics', self._on_diagnostics, _SAID)
         self._state_of(String, 'rtest/machine', lambda m: self.state.add_machine(m.data))
         self._state_of(
             CyclePlan, 'rtest/plan', lambda m: self.state.add_plan(messages.cycle_plan(m))
@@ -86,12 +89,15 @@ class ViewNode(Node):
 
     # --- what comes in ---
 
-    def _listen(self, kind: type, topic: str, take: Callable[[list[Any], float], None]) -> None:
+    def _listen(
+        self, kind: type, topic: str, take: Callable[[list[Any], float], None],
+        qos: QoSProfile = _LOSSY,
+    ) -> None:
         """A stream: all that has come is taken in one callback, as the recorder does."""
 
         def on_message(message: Any) -> None:
             batch = [message]
-            while len(batch) < _LOSSY.depth:
+            while len(batch) < qos.depth:
                 more = subscription.handle.take_message(kind, False)
                 if more is None:
                     break
@@ -99,7 +105,7 @@ class ViewNode(Node):
             self.handled += 1
             take(batch, time.monotonic())
 
-        subscription = self.create_subscription(kind, topic, on_message, _LOSSY)
+        subscription = self.create_subscription(kind, topic, on_message, qos)
 
     def _state_of(self, kind: type, topic: str, take: Callable[[Any], None]) -> None:
         """A latched topic; a message that cannot be read is told and left out."""
