@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
@@ -61,7 +62,9 @@ class Contents:
         self.attachments: list[tuple[int, int]] = []
         self._path = path
         self._damage = damage
-        # Bytes of what looked like a chunk and was none.
+        # The record before, where it gave no messages; bytes could be missing in it.
+        self._before: tuple[int, int, int] | None = None
+        # Bytes that were read for a chunk where there was none.
         self._in_vain = 0
 
     def stretches(self) -> Iterator[bytes]:
@@ -85,6 +88,7 @@ class Contents:
                 elif frame[0] == Opcode.CHUNK:
                     records, place = self._chunk(source, place, frame[1])
                 else:
+                    self._before = None if frame[0] == Opcode.MESSAGE else (place, *frame)
                     records, place = self._other(source, place, *frame)
                 if records:
                     yield records
@@ -95,41 +99,52 @@ class Contents:
         if length > MAX_CHUNK:
             self._damage.leave_out(f'record of {length} bytes')
             return None, end
+        # Half a chunk, with others behind it, does not end where another record begins.
+        alone = not source.framing.leads_on(end)
+        self._before = None
         try:
-            # Where lengths are wrong, bytes that look like a chunk may be none.
-            doubtful = self._damage.framing
+            doubtful = alone or self._damage.framing
             return _unpack(source.content(place, length), source.unpacker, doubtful), end
         except UserError:
             raise
         except DAMAGE as error:
-            # Half a chunk, with others behind it, does not end where another record begins.
-            if self._in_vain <= source.unpacker.file_size and not source.framing.leads_on(end):
-                self._in_vain += length
-                return None, self._step_over(source, place)
+            if alone and self._may_try(source, length):
+                return None, self._step_over(source, place, place)
             self._leave_out(error)
             return None, end
 
     def _unframed(self, source: _Open, place: int) -> _Step:
         """A place where a record should be and none can be believed."""
         length = source.framing.chunk_length(place)
-        # In a hostile file every place could be a chunk that reaches to its end.
-        if length is not None and self._in_vain <= source.unpacker.file_size:
+        if length is not None and self._may_try(source, length):
             try:
-                records = _unpack(source.content(place, length), source.unpacker, True)
+                records = _unpack(source.content(place, length), source.unpacker, doubtful=True)
             except UserError:
                 raise
             except DAMAGE:
-                self._in_vain += length
+                pass
             else:
+                self._before = None
                 self._damage.mend_frame(place)
                 return records, place + FRAME.size + length
-        return None, self._step_over(source, place)
+        begin, before = place, self._before
+        self._before = None
+        if before is not None and self._may_try(source, before[2]):
+            begin = place if _is_whole_attachment(source, *before) else before[0]
+        return None, self._step_over(source, begin, place)
 
-    def _step_over(self, source: _Open, place: int) -> int | None:
-        found = source.framing.find(place + 1)
+    def _may_try(self, source: _Open, length: int) -> bool:
+        """Whether so many bytes may be read once more; in a hostile file each could be a chunk."""
+        self._in_vain += length
+        return self._in_vain - length <= source.unpacker.file_size
+
+    def _step_over(self, source: _Open, begin: int, place: int) -> int | None:
+        """The next chunk, or the end, after the first byte from `begin`; none is at `place`."""
+        found = source.framing.find(begin + 1)
         if found is None:
             self._damage.cut = place
         else:
+            place = place if found > place else begin
             self._damage.skip(place, found - place)
         return found
 
@@ -166,3 +181,11 @@ def _unpack(content: bytes, unpacker: Unpacker, doubtful: bool) -> bytes:
     if doubtful and not is_proven(chunk, records):
         raise McapError('a chunk without checksum whose records do not fit it')
     return records
+
+
+def _is_whole_attachment(source: _Open, place: int, opcode: int, length: int) -> bool:
+    """Whether a record is an attachment as it was written; it could be a recording itself."""
+    if opcode != Opcode.ATTACHMENT or not 4 < length <= MAX_CHUNK:
+        return False
+    content = source.content(place, length)
+    return zlib.crc32(content[:-4]) == int.from_bytes(content[-4:], 'little')
