@@ -112,14 +112,11 @@ def _decompress(chunk: Chunk) -> bytes:
     raise McapError(f'a chunk packed with {printable(chunk.packing)!r}')
 
 
-def is_proven(chunk: Chunk, data: bytes) -> bool:
-    """Whether what was unpacked is a chunk, and not bytes that look like the beginning of one.
+def fits(chunk: Chunk, data: bytes) -> bool:
+    """Whether the records fill a chunk to its last byte, with log times within its own.
 
-    Where there is a checksum, unpacking has compared it. Without one the records must fill the
-    chunk to its last byte, and the log times of the messages must be within its own.
+    What a chunk without checksum has instead of one.
     """
-    if chunk.checksum:
-        return True
     place = 0
     while place + FRAME.size <= len(data):
         opcode, length = FRAME.unpack_from(data, place)

@@ -19,7 +19,7 @@ from rtest_estimation.mcap_chunk import (
     MAX_CHUNK,
     Unpacker,
     exact_stream,
-    is_proven,
+    fits,
     read_chunk,
 )
 from rtest_estimation.mcap_damage import Damage
@@ -99,16 +99,14 @@ class Contents:
         if length > MAX_CHUNK:
             self._damage.leave_out(f'record of {length} bytes')
             return None, end
-        # Half a chunk, with others behind it, does not end where another record begins.
-        alone = not source.framing.leads_on(end)
         self._before = None
         try:
-            doubtful = alone or self._damage.framing
-            return _unpack(source.content(place, length), source.unpacker, doubtful), end
+            return self._unpack(source, place, length, self._damage.framing), end
         except UserError:
             raise
         except DAMAGE as error:
-            if alone and self._may_try(source, length):
+            # Half a chunk, with others behind it, does not end where another record begins.
+            if not source.framing.leads_on(end) and self._may_try(source, length):
                 return None, self._step_over(source, place, place)
             self._leave_out(error)
             return None, end
@@ -118,7 +116,7 @@ class Contents:
         length = source.framing.chunk_length(place)
         if length is not None and self._may_try(source, length):
             try:
-                records = _unpack(source.content(place, length), source.unpacker, doubtful=True)
+                records = self._unpack(source, place, length, doubtful=True)
             except UserError:
                 raise
             except DAMAGE:
@@ -132,6 +130,20 @@ class Contents:
         if before is not None and self._may_try(source, before[2]):
             begin = place if _is_whole_attachment(source, *before) else before[0]
         return None, self._step_over(source, begin, place)
+
+    @staticmethod
+    def _unpack(source: _Open, place: int, length: int, doubtful: bool) -> bytes:
+        """Records of a chunk; an error of `DAMAGE` where they are damaged.
+
+        doubtful : whether bytes that look like a chunk may be none; a checksum dispels that
+        """
+        chunk = read_chunk(source.content(place, length))
+        records = source.unpacker.unpack(chunk)
+        if not chunk.checksum:
+            doubtful = doubtful or not source.framing.leads_on(place + FRAME.size + length)
+            if doubtful and not fits(chunk, records):
+                raise McapError('a chunk without checksum whose records do not fit it')
+        return records
 
     def _may_try(self, source: _Open, length: int) -> bool:
         """Whether so many bytes may be read once more; in a hostile file each could be a chunk."""
@@ -172,15 +184,6 @@ class Contents:
 
     def _leave_out(self, error: Exception) -> None:
         self._damage.leave_out(' '.join(str(error).split()) or type(error).__name__)
-
-
-def _unpack(content: bytes, unpacker: Unpacker, doubtful: bool) -> bytes:
-    """Records of a chunk; an error of `DAMAGE` where they are damaged or, in doubt, unproven."""
-    chunk = read_chunk(content)
-    records = unpacker.unpack(chunk)
-    if doubtful and not is_proven(chunk, records):
-        raise McapError('a chunk without checksum whose records do not fit it')
-    return records
 
 
 def _is_whole_attachment(source: _Open, place: int, opcode: int, length: int) -> bool:

@@ -29,6 +29,8 @@ LOSSES = 'rtest_losses'
 MENDED = 'rtest_mended'
 # Frame and times of a message record at once.
 _WHOLE = struct.Struct('<BQHIQQ')
+# Compared with for every message: looking up a member of an enumeration takes longer.
+_MESSAGE = int(Opcode.MESSAGE)
 # Losses are listed by topic; more than this is no list of topics.
 _MAX_LOSSES = 1000
 
@@ -59,6 +61,7 @@ class McapScan:
         self.losses: dict[str, int] = {}
         self._damage = Damage()
         self._topics = Topics(path, self._damage)
+        self._sources = self._topics.sources
         self._contents = Contents(path, self._damage)
         self.metadata = self._contents.metadata
 
@@ -72,7 +75,7 @@ class McapScan:
         """Topic to the profiles of its publishers as rosbag2 writes them (YAML)."""
         return {
             source.topic: source.channel.metadata.get('offered_qos_profiles', '')
-            for source in self._topics.sources.values()
+            for source in self._sources.values()
         }
 
     def messages(
@@ -124,7 +127,7 @@ class McapScan:
             if place + _WHOLE.size <= size:
                 opcode, length, channel, _, log_time, _ = _WHOLE.unpack_from(data, place)
                 end = place + FRAME.size + length
-                if opcode == Opcode.MESSAGE and length >= MESSAGE.size and end <= size:
+                if opcode == _MESSAGE and length >= MESSAGE.size and end <= size:
                     if channel in known:
                         if (found := known[channel]) is not None:
                             yield (*found, log_time, data[place + _WHOLE.size : end])
@@ -163,12 +166,14 @@ class McapScan:
 
     def _record(self, opcode: int, data: bytes, start: int, end: int) -> Entry | None:
         """The message in a part of the file; topics are remembered, others passed over."""
-        if opcode == Opcode.MESSAGE:
+        if opcode == _MESSAGE:
             if end - start < MESSAGE.size:
                 self._damage.leave_out('a message without times')
                 return None
             channel, sequence, log_time, publish_time = MESSAGE.unpack_from(data, start)
-            if (source := self._topics.find(channel)) is None:
+            # The call is for those that are not known yet.
+            source = self._sources.get(channel) or self._topics.find(channel)
+            if source is None:
                 self._damage.orphans += 1
                 return None
             return Entry(
