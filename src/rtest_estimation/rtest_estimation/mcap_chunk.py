@@ -106,9 +106,16 @@ def _decompress(chunk: Chunk) -> bytes:
         # zstandard believes the size in the frame, not the one it is given.
         if zstandard.frame_content_size(chunk.data) > size:
             raise McapError(f'a chunk of more than the {size} bytes that it says it has')
-        return zstandard.ZstdDecompressor().decompress(chunk.data, max_output_size=size)
+        # A length that is too large would take in what follows the chunk.
+        return zstandard.ZstdDecompressor().decompress(
+            chunk.data, max_output_size=size, allow_extra_data=False
+        )
     if chunk.packing == 'lz4':
-        return lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=size + 1)
+        decompressor = lz4.frame.LZ4FrameDecompressor()
+        data = decompressor.decompress(chunk.data, max_length=size + 1)
+        if decompressor.unused_data:
+            raise McapError('a chunk with more behind what is packed')
+        return data
     raise McapError(f'a chunk packed with {printable(chunk.packing)!r}')
 
 

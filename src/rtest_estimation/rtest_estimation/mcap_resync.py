@@ -14,7 +14,7 @@ from typing import BinaryIO
 from mcap.opcode import Opcode
 from mcap.writer import MCAP0_MAGIC
 
-from rtest_estimation.mcap_chunk import CHUNK, FOOTER, FRAME, MAX_CHUNK, MESSAGE, SIZE
+from rtest_estimation.mcap_chunk import CHUNK, FOOTER, FRAME, MAX_CHUNK, SIZE
 
 # What the records are made of (MCAP specification, "Records"): so many bytes, or, where negative,
 # a length of so many bytes and what it is the length of. Messages do not say how long they are.
@@ -62,6 +62,8 @@ class Framing:
         self._block, self._base = b'', 0
         self._has_chunks = False
         self._data_ended = False
+        # Up to where messages outside of chunks were followed, and whether that led on.
+        self._followed, self._led_on = 0, False
 
     def believed(self, place: int) -> tuple[int, int] | None:
         """Opcode and length of the record at a place; None where they cannot be true."""
@@ -70,16 +72,14 @@ class Framing:
         opcode, length = frame
         start = place + FRAME.size
         if opcode == Opcode.MESSAGE:
-            # An index whose opcode is damaged looks like one; after the data there is none.
-            index = self._has_chunks and self._own_length(Opcode.MESSAGE_INDEX, start) == length
-            return None if index or self._data_ended else frame
+            return frame if self._is_message(place, length) else None
         own = self._own_length(opcode, start) if opcode in _PARTS else None
         if own != length:
             # Unknown kinds are legal. What is a chunk but for its opcode is none of them.
             could_be = own is None or (opcode in _LOOSE and own > length)
             chunk = self.chunk_length(place) is not None
             return frame if could_be and not chunk and self.leads_on(start + length) else None
-        if opcode == Opcode.FOOTER and self._read(start + length, 8) != MCAP0_MAGIC:
+        if opcode == Opcode.FOOTER and not self._is_end(start + length):
             return None
         self._has_chunks |= opcode == Opcode.CHUNK
         self._data_ended |= opcode == Opcode.DATA_END
@@ -144,11 +144,41 @@ class Framing:
                 return place == self._size
             opcode, length = frame
             if opcode == Opcode.MESSAGE:
-                return length >= MESSAGE.size
+                return self._is_message(place, length)
             if opcode in _PARTS:
                 return self._own_length(opcode, place + FRAME.size) == length
             place += FRAME.size + length
         return True
+
+    def _is_message(self, place: int, length: int) -> bool:
+        """Whether a message outside of chunks can be believed: it has no fields to compare."""
+        if not self._has_chunks:
+            return True
+        # An index whose opcode is damaged looks like one; after the data there is none.
+        index = self._own_length(Opcode.MESSAGE_INDEX, place + FRAME.size)
+        if self._data_ended or index == length:
+            return False
+        # Beside chunks it is rare, and mostly from within a damaged one: then it leads nowhere.
+        if place >= self._followed:
+            self._followed, self._led_on = self._follow_messages(place)
+        return self._led_on
+
+    def _follow_messages(self, place: int) -> tuple[int, bool]:
+        """Where a row of messages ends, and whether another record is there."""
+        while (frame := self._frame(place)) is not None and frame[0] == Opcode.MESSAGE:
+            place += FRAME.size + frame[1]
+        if frame is None or frame[0] not in _PARTS:
+            return place, False
+        return place, self._own_length(frame[0], place + FRAME.size) == frame[1]
+
+    def _is_end(self, place: int) -> bool:
+        """Whether the file ends here, behind its footer; otherwise it is one that was copied."""
+        end = self._read(place, 2 * len(MCAP0_MAGIC))
+        if not end.startswith(MCAP0_MAGIC):
+            return False
+        place += len(MCAP0_MAGIC)
+        # Another file may follow; its topics have other numbers.
+        return place == self._size or end.endswith(2 * MCAP0_MAGIC) or self.find(place) is None
 
     def _read(self, place: int, count: int) -> bytes:
         self._file.seek(place)

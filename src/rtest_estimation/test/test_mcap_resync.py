@@ -208,6 +208,62 @@ def test_records_of_private_kinds_are_passed_over(tmp_path):
         assert scan.warnings == []
 
 
+def test_a_recording_in_an_attachment_stays_in_it(tmp_path):
+    """Also where the record behind it is damaged, and the search begins."""
+    other = Made(tmp_path / 'b.mcap', CompressionType.LZ4)
+    made = Made(tmp_path / 'a.mcap')
+    path = tmp_path / 'c.mcap'
+    with path.open('wb') as stream:
+        writer = Writer(stream)
+        writer.start('ros2', 'test')
+        writer.add_attachment(1, 2, 'b.mcap', 'application/mcap', other.data)
+        place = stream.tell()
+        writer.add_metadata('room', {'temperature': '20'})
+        writer.finish()
+    for bit in range(8 * FRAME.size):
+        assert made.read(flipped(path.read_bytes(), 8 * place + bit))[0] == []
+
+
+def test_an_end_in_the_middle_is_not_the_end(tmp_path):
+    """What the recorder wrote behind every chunk may be there still, after a power failure."""
+    made = Made(tmp_path / 'a.mcap', end='killed')
+    end = made.data[-FRAME.size - 20 - 8 - 13 :]
+    for place, _ in made.chunks[1:]:
+        found, scan = made.read(made.data[:place] + end + made.data[place:])
+        assert found == made.messages
+        assert not scan.intact
+        found, _ = made.read(made.data[:place] + end + made.data[place + len(end) :])
+        assert len(found) == len(made.messages) - PER_CHUNK
+    # A second recording behind the first is not mixed with it.
+    found, _ = made.read(made.data * 2)
+    assert found == made.messages
+
+
+def test_messages_copied_out_of_a_chunk_are_not_taken_for_others(tmp_path):
+    made = Made(tmp_path / 'a.mcap', CompressionType.NONE)
+    first, _ = made.chunks[1]
+    size = (made.chunks[1][1] - 49) // PER_CHUNK
+    copied = made.data[first + 49 : first + 49 + 2 * size]
+    assert copied[0] == copied[size] == 5
+    for _, place, _ in made.records[1:]:
+        found, scan = made.read(made.data[:place] + copied + b'x' + made.data[place:])
+        assert found == made.messages or place <= made.chunks[0][0]
+        assert not scan.intact
+
+
+def test_a_wrong_size_within_a_chunk_takes_nothing_in(tmp_path):
+    """What is packed ends before; what follows is no part of it."""
+    for compression in KINDS:
+        made = Made(tmp_path / f'{compression}.mcap', compression)
+        for number, (place, _) in enumerate(made.chunks[1:], 1):
+            size = 8 * (place + 9 + 32 + {1: 0, 2: 3, 3: 4}[compression.value])
+            for bit in range(64):
+                found, scan = made.read(flipped(made.data, size + bit))
+                # Without the last bytes of its packing it can still have the right checksum.
+                assert found in (made.without(number), made.messages)
+                assert not scan.intact
+
+
 def test_a_chunk_without_checksum_must_prove_itself(tmp_path):
     """Its records fill it and are of its time; otherwise it is none after damage."""
     made = Made(tmp_path / 'a.mcap', CompressionType.NONE, checksums=False)
@@ -286,10 +342,22 @@ def hostile(kind, total):
             parts.append(part)
             place += len(part)
         body = b''.join(parts)
+    elif kind == 'messages that hold chunks':
+        part = FRAME.pack(5, 22 + 57) + bytes(22) + opening(8, 8) + b'nonsense'
+        body = opening(8, 8) + b'nonsense' + part * (total // len(part)) + b'\0'
+    elif kind == 'metadata to the end of the file':
+        parts, place = [], 8
+        while place + 100 < total:
+            size = total - place - 57 - FRAME.size
+            part = opening(8, 8) + b'nonsense' + FRAME.pack(METADATA, size)
+            part += struct.pack('<II', 0, size - 8)
+            parts.append(part)
+            place += len(part)
+        body = b''.join(parts)
     else:
         part = FRAME.pack(0x90, 57) + opening(8, 8) + b'nonsense'
         body = part * (total // len(part)) + b'\0'
-    return MCAP0_MAGIC + body[:total]
+    return (MCAP0_MAGIC + body)[:total].ljust(total, b'\0')
 
 
 def seconds(path, data):
@@ -305,7 +373,8 @@ def seconds(path, data):
 @pytest.mark.parametrize(
     ('kind', 'size'),
     [
-        ('tiny chunks', 4), ('unknown records', 4), ('lengths that disagree', 20),
+        ('tiny chunks', 4), ('unknown records', 4), ('messages that hold chunks', 4),
+        ('metadata to the end of the file', 4), ('lengths that disagree', 20),
         ('chunks to the end of the file', 20),
     ],
 )
