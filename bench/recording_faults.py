@@ -6,10 +6,10 @@ Cuts: the bags of the project are cut, or zeroed from there on, at random places
 chunks before, as the mcap library counts them in the whole file, must be read. Bits: one in the
 opcode or length of a chunk is changed; everything must be read. Kills: a process that records
 1,000 messages a second is killed with SIGKILL at random moments; everything that was put more than
-a second before must be there. Full disk: the file may not grow beyond a random size; what was on the
-disk must stay, and where there is room again nothing may be missing. Stalled disk: fsync does not
-return while four times the allowed memory is sent; memory must stay within it, and what was not
-written must be counted in the recording.
+a second before must be there. Full disk: the file may not grow beyond a random size; what was on
+the disk must stay, and where there is room again nothing may be missing. Stalled disk: fsync does
+not return while four times the allowed memory is sent; memory must stay within it, and what was
+not written must be counted in the recording.
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
 """Reads an MCAP file from its beginning as far as it goes, without its index.
 
 A file whose writer was killed has no index, and one way of reading for all files is one way to
-test. Damage is stepped over, counted, and told in sentences: `mcap_chunk` unpacks chunks safely,
-`mcap_resync` finds the next one where a length is wrong. Nothing in the file is believed.
+test. Damage is stepped over, counted, and told in sentences; nothing in the file is believed.
+`mcap_contents` passes over its records, `mcap_resync` finds the next one where a length is wrong,
+`mcap_chunk` unpacks chunks.
 """
 
 from __future__ import annotations
