@@ -1,4 +1,4 @@
-"""Files full of what looks like chunks: read in time that grows with their size, not its square."""
+"""Files full of what looks like chunks: reading time grows with size, not with its square."""
 
 import struct
 import time
