@@ -3,12 +3,13 @@
     python bench/recording_faults.py [--points N] [--kills N] [--seed N]
 
 Cuts: the bags of the project are cut, or zeroed from there on, at random places; everything in the
-chunks before, as the mcap library counts them in the whole file, must be read. Kills: a process
-that records 1,000 messages a second is killed with SIGKILL at random moments; everything that was
-put more than a second before must be there. Full disk: the file may not grow beyond a random size;
-what was on the disk must stay, and where there is room again nothing may be missing. Stalled disk:
-fsync does not return while four times the allowed memory is sent; memory must stay within it, and
-what was not written must be counted in the recording.
+chunks before, as the mcap library counts them in the whole file, must be read. Bits: one in the
+opcode or length of a chunk is changed; everything must be read. Kills: a process that records
+1,000 messages a second is killed with SIGKILL at random moments; everything that was put more than
+a second before must be there. Full disk: the file may not grow beyond a random size; what was on
+the disk must stay, and where there is room again nothing may be missing. Stalled disk: fsync does
+not return while four times the allowed memory is sent; memory must stay within it, and what was
+not written must be counted in the recording.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / 'src/rtest_drivers/test'))
 
-from recording_faults import Outcome, cut, fill_disk, kill, random_places, stall
+from recording_faults import Outcome, cut, fill_disk, kill, misframe, random_places, stall
 
 from rtest_drivers.mcap_file import McapFile
 from rtest_drivers.message_types import MessageTypes
@@ -74,6 +75,8 @@ def main() -> None:
             rows += [
                 (f'{bag}: cut', lambda p=path, q=places: cut(p, q, folder)),
                 (f'{bag}: zeros from there on', lambda p=path, q=places: cut(p, q, folder, True)),
+                (f'{bag}: a bit before a chunk',
+                 lambda p=path: misframe(p, chosen.points, chosen.seed, folder)),
             ]
         rows += [
             ('killed with SIGKILL', lambda: kill(folder, chosen.kills, chosen.seed)),

@@ -94,6 +94,29 @@ def cut(path, places, folder, torn=False):
     return outcome
 
 
+def misframe(path, count, seed, folder):
+    """Change one bit in the opcode or length of a chunk of a whole recording."""
+    whole = path.read_bytes()
+    with path.open('rb') as file:
+        summary = make_reader(file).get_summary()
+    expected = summary.statistics.message_count
+    places = [index.chunk_start_offset for index in summary.chunk_indexes]
+    bits = [8 * place + bit for place in places for bit in range(8 * 9)]
+    chance = random.Random(seed)
+    damaged = folder / 'damaged.mcap'
+    outcome = Outcome()
+    for bit in chance.sample(bits, min(count, len(bits))):
+        changed = bytearray(whole)
+        changed[bit // 8] ^= 1 << bit % 8
+        damaged.write_bytes(changed)
+        bag = read_bag(damaged, ())
+        outcome.points += 1
+        outcome.opened += 1
+        outcome.told += bool(bag.warnings)
+        outcome.lost += abs(expected - sum(number for _, number in bag.topics.values()))
+    return outcome
+
+
 def random_places(path, count, seed):
     """Distinct places to cut a file at, its last byte among them."""
     size = path.stat().st_size

@@ -97,6 +97,31 @@ def test_a_cut_session_is_mended_for_every_reader(tmp_path):
     assert not (tmp_path / 'more').exists()
 
 
+def test_what_follows_a_damaged_length_is_mended_too(tmp_path):
+    bag = tmp_path / 'bag'
+    shutil.copytree(SHORT, bag)
+    file = bag / 'short.mcap'
+    before, summary = by_mcap(file)
+    index = sorted(summary.chunk_indexes, key=lambda one: one.chunk_start_offset)[5]
+    changed = bytearray(file.read_bytes())
+    # Its length, to the end of a later chunk, and its contents.
+    changed[index.chunk_start_offset + 3] ^= 1
+    changed[index.chunk_start_offset + index.chunk_length - 100] ^= 1
+    file.write_bytes(changed)
+    mended = mend(bag, tmp_path / 'fixed')
+    lost = sum(
+        index.message_start_time <= time <= index.message_end_time for _, _, time, _, _ in before
+    )
+    found, _ = by_mcap(tmp_path / 'fixed' / 'fixed.mcap')
+    rest = iter(before)
+    assert all(message in rest for message in found)
+    assert 0 < len(before) - len(found) <= lost
+    assert found[-1] == before[-1]
+    assert any(f'bytes at byte {index.chunk_start_offset}; what was recorded before and' in text
+               for text in mended.missing)
+    assert any('messages are missing' in text for text in mended.missing)
+
+
 def test_one_file_is_enough(tmp_path, capsys):
     cut = tmp_path / 'cut.mcap'
     cut.write_bytes((SHORT / 'short.mcap').read_bytes()[:123_456])

@@ -6,7 +6,7 @@ A few points of each kind; bench/recording_faults.py takes many.
 from pathlib import Path
 
 import pytest
-from recording_faults import chunk_ends, cut, fill_disk, kill, random_places, stall
+from recording_faults import chunk_ends, cut, fill_disk, kill, misframe, random_places, stall
 
 from rtest_drivers.mcap_file import McapFile
 from rtest_drivers.message_types import MessageTypes
@@ -34,6 +34,11 @@ def test_a_small_file_cut_at_every_byte(tmp_path):
     assert [count for _, count in chunk_ends(file.path)] == [2, 4]
     outcome = cut(file.path, range(size), tmp_path)
     assert (outcome.opened, outcome.told, outcome.lost) == (size, size, 0)
+
+
+def test_a_bit_in_the_opcode_or_length_of_a_chunk(tmp_path):
+    outcome = misframe(SHORT, 20, 4, tmp_path)
+    assert (outcome.opened, outcome.told, outcome.lost) == (20, 20, 0)
 
 
 def test_killed_while_it_takes_a_thousand_messages_a_second(tmp_path):

@@ -469,10 +469,12 @@ def test_huge_lengths_ask_for_no_memory(tmp_path):
     data = bytearray(bag.path.read_bytes())
     place = bag.chunks[2][0]
     assert data[place] == 6  # opcode of a chunk
-    # Its length is damaged: nothing after can be found. Then its unpacked size: it is left out.
+    # Its length is damaged: it says itself how long it is. Then its unpacked size: it is left out.
     data[place + 1 : place + 9] = (2**50).to_bytes(8, 'little')
     bag.path.write_bytes(data)
-    assert any('cut or damaged' in text for text in read_recording(bag.path).warnings)
+    recording = read_recording(bag.path)
+    assert any(f'is damaged at byte {place}: the kind or' in text for text in recording.warnings)
+    assert len(recording.gauges) == 20
     data = bytearray(make_session(tmp_path / 'bag.mcap').path.read_bytes())
     data[place + 25 : place + 33] = (2**50).to_bytes(8, 'little')
     bag.path.write_bytes(data)
