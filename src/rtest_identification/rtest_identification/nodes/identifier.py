@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-import os
 import time
+from dataclasses import dataclass
+from functools import partial
 
+import numpy as np
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rtest_msgs.msg import Cycle, ErrorMap, LocationErrors, ModelGap, NestCalibration
@@ -21,22 +23,43 @@ from rtest_estimation.nodes.run import run, when_time_goes_back
 from rtest_estimation.records import Cycle as CycleRecord
 from rtest_estimation.records import Kind
 from rtest_estimation.records import NestCalibration as NestRecord
-from rtest_identification.gap.model_file import load_model
-from rtest_identification.gap.offline import gap_session
+from rtest_identification.gap.model_file import Model, load_model
+from rtest_identification.gap.offline import SessionGap, gap_session
 from rtest_identification.gap.output import lines, summary
 from rtest_identification.gap.workflow import GapResult
 from rtest_identification.machine import Machine, parse_machine
 from rtest_identification.nodes import publish
+from rtest_identification.nodes.background import Background
 from rtest_identification.nodes.markers import position_markers
 from rtest_identification.observations import turns
 from rtest_identification.pipeline import Identification, identify
 
 # Verdicts on the model gap that leave nothing to be looked for.
 _GOOD = ('no gap', 'explained')
-# The comparison with the model takes seconds: it waits until no cycle has come for so long [s].
+# The comparison with the model waits until no cycle has come for so long [s].
 _REST_S = 1.0
-# Computing gives way to who reads and records.
-_NICE = 5
+
+
+@dataclass(frozen=True)
+class Compared:
+    """What came of a comparison, or why there is none. stamp : of the last cycle in it [ns]."""
+
+    stamp: int
+    found: SessionGap | UserError
+
+
+def compare(
+    machine: Machine,
+    cycles: tuple[CycleRecord, ...],
+    directions: dict[str, np.ndarray],
+    model: Model | None,
+) -> Compared:
+    """Compare a model with what was measured; takes seconds."""
+    stamp = max(cycle.stamp for cycle in cycles)
+    try:
+        return Compared(stamp, gap_session(machine, cycles, directions, model))
+    except UserError as error:
+        return Compared(stamp, error)
 
 
 class IdentifierNode(Node):
@@ -48,6 +71,8 @@ class IdentifierNode(Node):
     def __init__(self) -> None:
         super().__init__('identifier')
         self._machine: Machine | None = None
+        # It takes seconds, in which the node goes on saying how it is.
+        self._comparison = Background(self._on_compared)
         self._begin()
         self._back = when_time_goes_back(self, self._begin)
         self._problem = 'waiting for the machine'
@@ -69,8 +94,9 @@ class IdentifierNode(Node):
         self._cycles: list[CycleRecord] = []
         self._result: Identification | None = None
         self._found: GapResult | None = None
-        # What the comparison with the model said of these cycles; '' until it was made.
-        self._compared, self._came = '', 0.0
+        # Whether the comparison with the model was begun for the cycles so far, and what the last
+        # one said; when the last static cycle came.
+        self._asked, self._verdict, self._came = False, '', 0.0
 
     def _on_machine(self, message: String) -> None:
         try:
@@ -91,7 +117,7 @@ class IdentifierNode(Node):
             self._begin()
         self._cycles = counted([*self._cycles, cycle])
         if cycle.plan.kind is Kind.STATIC:
-            self._compared, self._came = '', time.monotonic()
+            self._asked, self._came = False, time.monotonic()
             self._identify()
 
     def _on_nest(self, message: NestCalibration) -> None:
@@ -99,7 +125,7 @@ class IdentifierNode(Node):
         self._nests[nest.calibration] = nest
         if any(c.calibration == nest.calibration and turns(self._machine, c.plan)
                for c in self._cycles if self._machine is not None):
-            self._compared = ''
+            self._asked = False
 
     def _identify(self) -> None:
         if self._machine is None or not any(turns(self._machine, c.plan) for c in self._cycles):
@@ -128,7 +154,11 @@ class IdentifierNode(Node):
         response.success = self._result is not None
         response.message = self._summary()
         if self._result is not None:
-            response.message += f'; {self._find_gap()}'
+            self._comparison.wait()
+            if not self._asked:
+                self._compare()
+                self._comparison.wait()
+            response.message += f'; {self._verdict}'
             self._report()
         return response
 
@@ -139,28 +169,26 @@ class IdentifierNode(Node):
             (self._nests[name] for name in names if name in self._nests), key=lambda n: n.stamp
         )
 
-    def _find_gap(self) -> str:
-        """What the comparison with the model says of the cycles so far; it is made once."""
-        if not self._compared:
-            self._compared = self._compare()
-        return self._compared
-
-    def _compare(self) -> str:
-        """Compare model and measurement, publish what was found, and sum it up."""
+    def _compare(self) -> None:
+        """Begin to compare model and measurement, with the cycles so far."""
+        self._asked = True
         cycles = tuple(self._cycles)
         directions = {
             cycle.plan.setup: self._nests[cycle.calibration].sensitive
             for cycle in cycles
             if cycle.calibration in self._nests
         }
-        try:
-            found = gap_session(self._machine, cycles, directions, self._model)
-        except UserError as error:
-            return f'no comparison with the model: {error}'
-        stamp = max(cycle.stamp for cycle in cycles)
-        self._gap.publish(publish.model_gap(found, stamp))
-        self._found = found.result
-        return summary(found.result)
+        self._comparison.start(
+            partial(compare, self._machine, cycles, directions, self._model)
+        )
+
+    def _on_compared(self, compared: Compared) -> None:
+        if isinstance(compared.found, UserError):
+            self._verdict = f'no comparison with the model: {compared.found}'
+        elif any(c.plan.session == compared.found.session for c in self._cycles):
+            self._gap.publish(publish.model_gap(compared.found, compared.stamp))
+            self._found = compared.found.result
+            self._verdict = summary(self._found)
 
     def _summary(self) -> str:
         if self._result is None:
@@ -172,9 +200,10 @@ class IdentifierNode(Node):
         )
 
     def _report(self) -> None:
+        self._comparison.poll()
         waited = time.monotonic() - self._came > _REST_S
-        if self._result is not None and not self._compared and waited:
-            self._find_gap()
+        if self._result is not None and not (self._asked or self._comparison.busy) and waited:
+            self._compare()
         warnings = self._result.warnings if self._result else ()
         # Waiting is no fault, what cannot be identified is.
         static = any(c.plan.kind is Kind.STATIC for c in self._cycles)
@@ -196,7 +225,6 @@ class IdentifierNode(Node):
 
 def main(args: list[str] | None = None) -> int:
     """Entry point."""
-    os.nice(_NICE)
     return run(IdentifierNode, args)
 
 
