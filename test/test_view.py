@@ -132,7 +132,7 @@ def topics(graph) -> Iterator:
     import rclpy
     from rclpy.context import Context
     from rclpy.executors import SingleThreadedExecutor
-    from rtest_msgs.msg import Cycle, GaugeSamples, LocationErrors
+    from rtest_msgs.msg import Cycle, GaugeSamples, LocationErrors, ModelGap
     from sensor_msgs.msg import JointState
     from std_msgs.msg import String
 
@@ -145,7 +145,7 @@ def topics(graph) -> Iterator:
     for name, kind, qos in (
         ('gauges', GaugeSamples, 1), ('cnc/feedback', JointState, 1),
         ('cycle', Cycle, LATCHED_100), ('location_errors', LocationErrors, LATCHED_100),
-        ('mark', String, LATCHED_100),
+        ('model_gap', ModelGap, LATCHED_100), ('mark', String, LATCHED_100),
     ):
         heard[name] = []
         node.create_subscription(kind, f'rtest/{name}', heard[name].append, qos)
@@ -343,6 +343,10 @@ def test_results_and_missing_poses_are_shown(graph, topics) -> None:
     assert page.locator('#poses button.missing').count() == 1
     assert page.locator('#poses button.done').count() == len(cycle.points)
     assert '×' in page.inner_text('#picture-factor')
+    # The comparison with the model comes some seconds later, and says of which cycles it is.
+    page.wait_for_selector("#gap:has-text('up to 1a-static')")
+    gap = topics.next('model_gap')
+    assert page.inner_text('#gap .badge') == gap.verdict
     # The session has no run-out cycle: that stands beside the numbers it concerns.
     page.wait_for_selector("#location-card #warnings li:has-text('run-out')")
     # Something was drawn: not every pixel is transparent.

@@ -134,6 +134,7 @@ def pictures(page, folder):
     yield take(page, folder, 'poses', 'poses-card')
     measure(page, '2b-static')
     # What the identifier says of its verdict comes after it.
+    page.wait_for_selector("#gap:has-text('up to 2b-static')")
     page.wait_for_selector('#gap .badge.ok, #gap li')
     page.set_viewport_size(TALL)
     yield take(page, folder, 'results', 'picture-card')

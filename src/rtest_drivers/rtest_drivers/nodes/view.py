@@ -163,7 +163,8 @@ class ViewNode(Node):
 
     def _on_gap(self, m: ModelGap) -> None:
         self.state.add_result('gap', results.model_gap(
-            m.verdict, m.effects, m.confidence, m.rivals, m.noise, m.before, m.after
+            m.verdict, m.effects, m.confidence, m.rivals, m.noise, m.before, m.after,
+            messages.nanoseconds(m.header.stamp),
         ))
 
     def _on_markers(self, message: MarkerArray) -> None:

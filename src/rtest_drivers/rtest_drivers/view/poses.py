@@ -25,6 +25,7 @@ class PoseMap:
     def __init__(self, plan: CyclePlan, machine: Machine | None) -> None:
         self.plan = plan
         self.finished = False
+        self._ended: int | None = None
         self._reached = 0
         self._missing: dict[int, str] = {}
         self._done: frozenset[int] = frozenset()
@@ -43,7 +44,7 @@ class PoseMap:
 
     def finish(self, cycle: Cycle) -> None:
         """The finished cycle says which poses were measured and which were not."""
-        self.finished = True
+        self.finished, self._ended = True, cycle.stamp
         self._done = frozenset(point.index for point in cycle.points)
         self._missing = {
             item.index: self._missing.get(item.index) or 'missing' for item in cycle.missing
@@ -62,6 +63,8 @@ class PoseMap:
             'kind': KINDS[self.plan.kind],
             'setup': self.plan.setup,
             'finished': self.finished,
+            # As text: a number of JavaScript has not so many digits.
+            'ended': str(self._ended),
             'rows': rows,
             'columns': columns,
             'places': places,

@@ -71,12 +71,13 @@ def error_map(
 
 def model_gap(
     verdict: str, effects: Sequence[str], confidence: Sequence[float], rivals: Sequence[str],
-    noise: float, before: float, after: float,
+    noise: float, before: float, after: float, stamp: int,
 ) -> dict[str, Any]:
-    """Verdict of the comparison with the model, rms in µm."""
+    """Verdict of the comparison with the model, rms in µm; stamp of its last cycle [ns]."""
     before_um, after_um, noise_um = _micro([before, after, noise])
     return {
         'verdict': verdict,
+        'ended': str(stamp),
         'effects': [
             {'key': key, 'confidence': round(float(sure), 3), 'rivals': others}
             for key, sure, others in zip(effects, confidence, rivals, strict=True)

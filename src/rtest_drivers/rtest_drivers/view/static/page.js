@@ -18,6 +18,8 @@ function showPart(name, shown) {
   if (name.startsWith('cycle:')) {
     if (shown === null) forgetCycle();
     drawPoses();
+    // The verdict names the last cycle it is of.
+    if (cell.parts.gap) drawResults();
   } else if (RESULTS.includes(name)) drawResults();
   else if (name === 'picture') drawPicture();
   else if (name.startsWith('map:')) drawMaps();

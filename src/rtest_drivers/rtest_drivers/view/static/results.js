@@ -38,7 +38,10 @@ function drawGap() {
       'after a cycle.'));
     return;
   }
-  const line = element('h3', '', 'Model against measurement: ');
+  const cycles = Object.keys(cell.parts).filter((name) => name.startsWith('cycle:'));
+  const last = cycles.map((name) => cell.parts[name]).find((one) => one.ended === gap.ended);
+  const line = element('h3', '',
+    `Model against measurement${last ? `, up to ${last.cycle}` : ''}: `);
   line.append(element('span', `badge ${LEVELS[gap.verdict] || 'error'}`, gap.verdict));
   const after = gap.effects.length ?
     `; with the effects below ${number(gap.after, 2)} µm` : '; no known effect was added';
