@@ -136,7 +136,7 @@ def _check(path: Path, arguments: argparse.Namespace) -> bool:
 
     config = load_session(path)
     chain = _is_chain(path, arguments.check)
-    example = 'config/check_example.yaml'
+    example = shown(config_path('check_example.yaml'))
     if arguments.simulate is not None:
         if not chain:
             raise UserError(
@@ -150,12 +150,12 @@ def _check(path: Path, arguments: argparse.Namespace) -> bool:
     wrong = check_session_devices(config, arguments.moves)
     for line in wrong:
         print(f'rtest: {line}', file=sys.stderr)
-    if config.devices:
-        print(f'{shown(path)}: '
-              + (f'{len(wrong)} found wrong' if wrong else 'every device answers'))
     if not wrong and not chain and arguments.check == CHAIN:
         print('the whole chain, with nest, sphere and noise, is checked with a session file of '
               f'cycle: {{kind: check}}, as {example}')
+    if config.devices:
+        print(f'{shown(path)}: '
+              + (f'{len(wrong)} found wrong' if wrong else 'every device answers'))
     return not wrong
 
 
