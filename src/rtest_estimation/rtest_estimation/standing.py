@@ -39,10 +39,13 @@ class Standing:
     """Readings of all gauges over a stretch in which all axes stood still.
 
     rate : [1/s]; readings : (n, gauges) [m], evenly spaced
+    steps : (gauges,) smallest difference of two readings of the whole recording, the resolution
+        of a gauge whose noise is below it [m]; infinite of one that always read the same
     """
 
     rate: float
     readings: np.ndarray
+    steps: np.ndarray
 
     @property
     def duration(self) -> float:
@@ -56,27 +59,35 @@ class Standing:
 
     @property
     def noise(self) -> np.ndarray:
-        """(gauges,) standard deviation of single readings about a straight line [m]."""
-        return signal.detrend(self.readings, axis=0).std(axis=0, ddof=2)
+        """(gauges,) standard deviation of single readings about a straight line [m].
+
+        At least that of rounding to the resolution, which the readings need not show.
+        """
+        return np.maximum(self._scatter, self.steps / np.sqrt(12.0))
 
     @property
-    def drift(self) -> np.ndarray:
-        """(gauges,) slope [m/s]."""
+    def change(self) -> np.ndarray:
+        """(gauges,) change over the stretch, by a straight line [m]."""
         times = np.arange(len(self.readings)) / self.rate
-        return np.polyfit(times, self.readings, 1)[0]
+        return np.polyfit(times, self.readings, 1)[0] * self.duration
 
     @property
-    def drift_spread(self) -> np.ndarray:
-        """(gauges,) expanded uncertainty of the slope at 95 % [m/s].
+    def change_spread(self) -> np.ndarray:
+        """(gauges,) expanded uncertainty of the change at 95 % [m].
 
         From the scatter of the means of `_BLOCKS` parts about a line: readings next to each other
-        are not independent where there is hum.
+        are not independent where there is hum. Beside it a step of the resolution.
         """
         length = len(self.readings) // _BLOCKS
         means = self.readings[: _BLOCKS * length].reshape(_BLOCKS, length, -1).mean(axis=1)
         times = np.arange(_BLOCKS) * length / self.rate
         _, covariance = np.polyfit(times, means, 1, cov=True)
-        return stats.t.ppf(0.975, _BLOCKS - 2) * np.sqrt(covariance[0, 0])
+        slope = stats.t.ppf(0.975, _BLOCKS - 2) * np.sqrt(covariance[0, 0])
+        return slope * self.duration + np.where(self.steps > self._scatter, self.steps, 0.0)
+
+    @property
+    def _scatter(self) -> np.ndarray:
+        return signal.detrend(self.readings, axis=0).std(axis=0, ddof=2)
 
     def lines(self, gauge: int) -> list[Line]:
         """Lines that stand out of a gauge's noise, the strongest first.
@@ -132,6 +143,7 @@ def longest_standing(
     part, stamps, readings = part[good], stamps[good], readings[good]
     if not len(part):
         return None
+    steps = np.array([_step(column) for column in readings.T])
     names, counts = np.unique(part, return_counts=True)
     chosen = part == names[counts.argmax()]
     stamps, readings = (stamps[chosen] - stamps[chosen][0]) * 1e-9, readings[chosen]
@@ -141,7 +153,14 @@ def longest_standing(
     return Standing(
         (len(stamps) - 1) / float(stamps[-1]),
         np.column_stack([np.interp(even, stamps, column) for column in readings.T]),
+        steps,
     )
+
+
+def _step(readings: np.ndarray) -> float:
+    """Smallest difference of two different readings [m]; infinite where there are none."""
+    values = np.unique(readings)
+    return float(np.diff(values).min()) if len(values) > 1 else np.inf
 
 
 def _away(stamps: np.ndarray, moving: np.ndarray) -> np.ndarray:

@@ -13,7 +13,7 @@ def standing(rate=500.0, seconds=20.0, lines=(), noise=0.1e-6, drift=0.0, seed=3
     for frequency, amplitude in lines:
         readings[:, 0] += amplitude * np.sin(2 * np.pi * frequency * times + 0.4)
     readings[:, 0] += drift * times
-    return Standing(rate, readings)
+    return Standing(rate, readings, np.zeros(2))
 
 
 def test_a_hum_is_found_with_its_amplitude_and_only_where_it_is() -> None:
@@ -36,7 +36,7 @@ def test_noise_alone_has_no_lines_but_in_one_spectrum_of_a_hundred() -> None:
 
 def test_drift_is_no_line_and_not_in_the_noise() -> None:
     found = standing(drift=1e-6)
-    assert found.drift[0] == pytest.approx(1e-6, rel=1e-2)
+    assert found.change[0] == pytest.approx(20e-6, rel=1e-2)
     assert found.noise == pytest.approx([0.1e-6, 0.1e-6], rel=0.03)
     assert found.lines(0) == []
 
@@ -50,7 +50,7 @@ def test_the_uncertainty_of_a_drift_covers_it(lines) -> None:
         # Readings begin anywhere in a period.
         shifted = [(f * (1.0 + 0.02 * rng.standard_normal()), a) for f, a in lines]
         found = standing(50.1, 30.0, shifted, drift=drift, seed=seed)
-        inside += abs(found.drift[0] - drift) <= found.drift_spread[0]
+        inside += abs(found.change[0] - drift * found.duration) <= found.change_spread[0]
     # 95 of 100 are wanted; fewer than 88 has probability 1e-3 (binomial).
     assert inside >= 88
 
@@ -91,6 +91,17 @@ def test_readings_near_a_motion_are_left_out() -> None:
     # recording.
     assert found.readings[0, 0] == pytest.approx(170e-9, abs=1.1e-9)
     assert found.readings[-1, 0] == pytest.approx(420e-9)
+
+
+def test_the_resolution_is_that_of_the_whole_recording() -> None:
+    gauges, feedback = recording()
+    coarse = [
+        GaugeBlock(b.stamp, b.sequence, 0.0, np.round(b.displacement / 1e-7) * 1e-7, b.status)
+        for b in gauges
+    ]
+    found = longest_standing(coarse, feedback)
+    assert found.steps[0] == pytest.approx(1e-7) and found.steps[1] == np.inf
+    assert found.noise[0] >= 1e-7 / 12.0**0.5
 
 
 def test_uneven_times_are_made_even() -> None:

@@ -20,8 +20,7 @@ SPINDLE = 'S'
 # To the first pose of a check.
 VISITS = 10
 # How long the sphere stands still for the noise of the gauges [s], at each of two places so far
-# above and below its nominal one [m]: a drift of 1 um in 10 min is then seen beside a noise of
-# some tenths of a micrometre.
+# above and below its nominal one [m]: lines of 50 and 60 Hz and of a spindle are then apart.
 STANDING_S, _STANDING_STEP = 30.0, 1e-4
 # Twelve uneven stations of a full turn. Even ones show harmonic n and 12 - n as one and the same;
 # of these the sum of exp(i n C) is at most 0.33 of the number of stations for every n up to 22, so

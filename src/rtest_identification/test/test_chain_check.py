@@ -16,18 +16,14 @@ from rtest_estimation.records import (
 )
 from rtest_estimation.standing import Standing
 from rtest_identification.chain_check import (
-    OPEN,
-    RIGHT,
-    WRONG,
     calibration,
     check_chain,
     gauges,
-    noise,
     repeatability,
-    source_of,
     sphere_runout,
-    temperature,
 )
+from rtest_identification.finding import OPEN, RIGHT, WRONG
+from rtest_identification.noise_check import noise, source_of, temperature
 from rtest_identification.observations import turns
 from rtest_identification.session_file import load_session
 
@@ -125,17 +121,59 @@ def test_ten_visits_to_one_pose() -> None:
 def standing(rate=500.0, seconds=20.0, line=0.0, frequency=50.0, spread=0.1e-6):
     times = np.arange(round(rate * seconds)) / rate
     readings = spread * np.random.default_rng(6).standard_normal((len(times), 1))
-    return Standing(rate, readings + line * np.sin(2 * np.pi * frequency * times)[:, None])
+    readings += line * np.sin(2 * np.pi * frequency * times)[:, None]
+    return Standing(rate, readings, np.zeros(1))
 
 
 def test_hum_is_named_and_too_much_of_it_is_wrong() -> None:
     found = {one.what: one for one in noise(standing(line=0.5e-6))}
     assert found['gauge 1 strongest line'].verdict == WRONG
     assert 'mains 50 Hz' in found['gauge 1 strongest line'].value
-    assert found['gauge 1 drift'].verdict == RIGHT
+    assert found['gauge 1 change'].verdict == RIGHT
     quiet = verdicts(noise(standing()))
     assert set(quiet.values()) == {RIGHT}
     assert verdicts(noise(standing(spread=1e-6)))['gauge 1 noise'] == WRONG
+
+
+def test_a_gauge_that_never_changes_is_stuck_not_quiet() -> None:
+    dead = Standing(50.0, np.full((1500, 1), 3e-6), np.array([np.inf]))
+    found = noise(dead)
+    assert [(one.what, one.verdict) for one in found[:-1]] == [('gauge 1 noise', WRONG)]
+    assert 'stuck' in found[0].advice
+
+
+@pytest.mark.parametrize(('step', 'verdict'), [(1e-6, RIGHT), (5e-6, WRONG)])
+def test_a_coarse_gauge_is_not_taken_for_a_quiet_one(step, verdict) -> None:
+    """Of an indicator whose readings do not change while the sphere stands."""
+    found = {one.what: one for one in noise(
+        Standing(50.0, np.full((1500, 1), 7 * step), np.array([step]))
+    )}
+    assert found['gauge 1 noise'].verdict == verdict and 'steps of' in found['gauge 1 noise'].value
+    assert found['gauge 1 strongest line'].verdict == OPEN
+    assert found['gauge 1 change'].verdict == OPEN
+
+
+def test_a_slow_swing_is_told_as_what_it_is_in_that_time() -> None:
+    times = np.arange(1500) / 50.0
+    readings = 0.15e-6 * np.sin(2 * np.pi * times / 120.0)[:, None]
+    readings += 0.05e-6 * np.random.default_rng(3).standard_normal((1500, 1))
+    found = {one.what: one for one in noise(Standing(50.0, readings, np.zeros(1)))}
+    assert found['gauge 1 change'].verdict == RIGHT
+    assert found['gauge 1 change'].value.startswith('+0.1') and 'in 30 s' in (
+        found['gauge 1 change'].value
+    )
+
+
+def test_a_gain_that_is_off_is_named_beside_the_residual_it_makes() -> None:
+    found = {one.what: one for one in calibration(nest(gain=(1.0, 1.0, 1.0399), residual=19e-6))}
+    assert 'gauge 3 has a gain of 1.0399' in found['nest calibration residual'].advice
+
+
+def test_a_calibration_that_failed_is_wrong_and_one_not_made_is_open() -> None:
+    failed = Finished(cycle(Kind.NEST_CALIBRATION, np.zeros((1, 2)), [np.zeros(3)]).cycle,
+                      problem='gauge 2 moves 0 m per metre')
+    found = check_chain([failed], None, {}, UP)[0]
+    assert (found.verdict, found.advice) == (WRONG, 'gauge 2 moves 0 m per metre')
 
 
 def test_a_line_is_told_by_where_it_comes_from_also_when_folded() -> None:

@@ -46,7 +46,8 @@ def judge(path: Path, direction: Sequence[float], rpm: float | None = None) -> i
     from rtest_estimation.bagfile import read_bag
     from rtest_estimation.recording import TYPES, recording_of, temperatures
     from rtest_estimation.standing import longest_standing
-    from rtest_identification import chain_check
+    from rtest_identification.chain_check import check_chain
+    from rtest_identification.finding import OPEN, WRONG
     from rtest_identification.offline import estimate_recording
 
     towards = np.array(direction)
@@ -57,7 +58,7 @@ def judge(path: Path, direction: Sequence[float], rpm: float | None = None) -> i
         raise UserError(f'--spindle-rpm: expected a positive number, got {rpm:g}')
     bag = read_bag(path, TYPES)
     recording = recording_of(bag)
-    found = chain_check.check_chain(
+    found = check_chain(
         estimate_recording(recording),
         longest_standing(recording.gauges, recording.feedback),
         temperatures(bag, []),
@@ -70,10 +71,10 @@ def judge(path: Path, direction: Sequence[float], rpm: float | None = None) -> i
               + (f'  (limit: {one.limit})' if one.limit else ''))
         if one.advice:
             print(f'{"":6}{"":{width}}  -> {one.advice}')
-    wrong = [one.what for one in found if one.verdict == chain_check.WRONG]
+    wrong = [one.what for one in found if one.verdict == WRONG]
     if recording.lost:
         wrong.append(f'{recording.lost} readings lost')
-    unknown = sum(one.verdict == chain_check.OPEN for one in found)
+    unknown = sum(one.verdict == OPEN for one in found)
     for what in wrong:
         print(f'rtest: wrong: {what}', file=sys.stderr)
     print(f'{path}: {len(found)} looked at, {len(wrong)} wrong, {unknown} left open')
