@@ -127,7 +127,8 @@ def run(
                 guard.write(f'{child.pid} {int(command.name == last)}\n')
                 guard.flush()
             needed = {c.name: children[c.name] for c in commands if not c.optional}
-            failed = _watch(needed, leader, received)
+            optional = {c.name: (children[c.name], c.log) for c in commands if c.optional}
+            failed = _watch(needed, leader, received, optional)
             # What failed by itself is known; what ends from here on was told to.
             codes = {name: child.poll() for name, child in children.items()}
         finally:
@@ -151,10 +152,19 @@ def run(
 
 
 def _watch(
-    children: dict[str, subprocess.Popen], leader: str, received: list[int]
+    children: dict[str, subprocess.Popen],
+    leader: str,
+    received: list[int],
+    optional: dict[str, tuple[subprocess.Popen, Path]],
 ) -> str | None:
-    """Wait for the first to end or for a signal; returns who failed, None for a normal end."""
+    """Wait for the first to end or for a signal; returns who failed, None for a normal end.
+
+    optional : the others and their logs; that one of them has ended is told
+    """
     while not received:
+        for name in [name for name, (child, _) in optional.items() if child.poll() is not None]:
+            _, log = optional.pop(name)
+            print(f'node {name} has ended, the session goes on; its log: {log}', flush=True)
         # The leader last: when a node and the leader end together, the node is the cause.
         for name in sorted(children, key=lambda name: name == leader):
             code = children[name].poll()

@@ -105,7 +105,7 @@ def test_a_node_that_dies_stops_all_and_is_named_with_its_last_words(tmp_path):
         assert not lives(pid_in(tmp_path / f'{name}.log'))
 
 
-def test_a_session_goes_on_without_a_page(tmp_path):
+def test_a_session_goes_on_without_a_page(tmp_path, capsys):
     dying = command(tmp_path, 'view', "import sys; sys.exit('the port is taken')")
     leader = 'import time; time.sleep(1.0)'
     assert run([
@@ -113,6 +113,10 @@ def test_a_session_goes_on_without_a_page(tmp_path):
         replace(dying, optional=True),
         command(tmp_path, 'session', leader),
     ])
+    log = tmp_path / 'view.log'
+    assert capsys.readouterr().out == (
+        f'node view has ended, the session goes on; its log: {log}\n'
+    )
 
 
 def test_a_node_that_is_killed_is_named_with_the_signal(tmp_path):

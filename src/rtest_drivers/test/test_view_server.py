@@ -5,6 +5,7 @@ import ipaddress
 import json
 import re
 import socket
+import time
 from importlib.resources import files
 from urllib.parse import urlsplit
 
@@ -24,7 +25,7 @@ class Cell:
     def __init__(self, host='127.0.0.1'):
         self.asked, self.marked = [], []
         self.state = CellState()
-        self.state.add_report(Report('/recorder', 0, 'recording', {}, 0.0))
+        self.state.add_report(Report('/recorder', 0, 'recording', {}, time.monotonic()))
         self.server = Server(self.state, self._ask, self._mark, host)
 
     async def _ask(self, wish):
@@ -216,7 +217,7 @@ def test_marks_are_limited_in_length_and_to_one_line() -> None:
     for text in ('', '   ', 'x' * 201, 'two\nlines', 7):
         assert cell.post('/mark', {'text': text})[0] == 400
     assert cell.marked == ['door opened']
-    cell.state.add_report(Report('/recorder', 0, 'finished', {}, 0.0))
+    cell.state.add_report(Report('/recorder', 0, 'finished', {}, time.monotonic()))
     answer = cell.post('/mark', {'text': 'late'})[1]
     assert not answer['granted'] and 'finished' in answer['answer']
 

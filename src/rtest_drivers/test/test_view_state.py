@@ -327,10 +327,34 @@ def test_error_maps_over_one_axis_and_over_both() -> None:
                                   'U': [[0.0] * 3] * 2}
 
 
+def test_a_recorder_that_is_silent_is_told_where_its_numbers_are() -> None:
+    state = CellState()
+    values = {'bytes': '37000', 'lost': '0'}
+    state.add_report(Report('recorder: recording', 0, 'recording', values, 0.0))
+    assert state.tick(2.0)['recording']['text'] == 'recording'
+    told = state.tick(4.0)['recording']
+    assert told['level'] == 'error' and 'nothing heard for 4 s' in told['text']
+    assert device(state, 4.0, 'recorder')['level'] == 'error'
+    state.add_report(Report('recorder: recording', 0, 'recording', values, 5.0))
+    assert state.tick(5.5)['recording']['level'] == 'ok'
+    # The end of a session is no silence.
+    state.add_report(Report('session: progress', 0, 'finished', {'state': 'finished'}, 6.0))
+    assert state.tick(60.0)['recording']['level'] == 'ok'
+
+
+def test_notes_of_the_identifier_are_shown_beside_its_warnings() -> None:
+    state = CellState()
+    said = {'warning 1': 'w', 'note 1': 'error motions are not in U', 'note 2': 'n'}
+    state.add_report(Report('identifier: session', 1, '8 errors', said, 0.0))
+    assert state.parts['warnings'][1] == ['w']
+    assert state.parts['notes'][1] == ['error motions are not in U', 'n']
+
+
 def test_a_mark_needs_somebody_who_records_it() -> None:
     state = CellState()
-    assert 'no recorder' in state.problem()
+    assert 'no recorder' in state.problem(0.5)
     state.add_report(Report('/recorder', 0, 'recording', {}, 0.0))
-    assert state.problem() == ''
+    assert state.problem(0.5) == ''
+    assert 'nothing was heard' in state.problem(5.0)
     state.add_report(Report('/recorder', 0, 'finished', {}, 0.0))
-    assert 'finished' in state.problem()
+    assert 'finished' in state.problem(0.5)

@@ -208,7 +208,7 @@ def measure(
     except (NodeFailed, Stopped) as error:
         if settings.recording.exists():
             error.args = (
-                f'{error}\n  recorded so far: {shown(settings.recording)}; to identify it: '
+                f'{error}\n  recorded so far: {shown(settings.recording)}; to evaluate it: '
                 f'{_again(settings)}',
             )
         raise
@@ -246,7 +246,7 @@ def _again(settings: GraphSettings) -> str:
     from rtest_identification.session_cycle import DYNAMIC
     from rtest_identification.session_file import load_session
 
-    command = 'thermal' if settings.thermal else 'identify'
+    command = 'thermal' if settings.thermal else 'check' if settings.checks else 'identify'
     if load_session(settings.config).kind == DYNAMIC:
         command = 'dynamic'
     return f'rtest {command} {shlex.quote(shown(settings.folder))}'

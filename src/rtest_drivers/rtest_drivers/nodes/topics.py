@@ -19,8 +19,11 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 
 from rtest_estimation.errors import UserError
 
-# A graph is found when nothing new has appeared for so long, or it is time to look [s].
-_QUIET_S, _LONGEST_S = 1.5, 8.0
+# A graph is found when nothing new has appeared for so long, or it is time to look [s]. A busy
+# computer finds the publishers of a node some seconds after those of another.
+_QUIET_S, _LONGEST_S = 4.0, 20.0
+# Nothing at all is believed after this time [s].
+_EMPTY_S = 8.0
 # Of a long array so many elements are printed.
 _SHOWN = 24
 
@@ -107,7 +110,9 @@ class Looker:
         """Wait until the graph has been found."""
         start = changed = time.monotonic()
         seen: list[Topic] = []
-        while (now := time.monotonic()) - start < _LONGEST_S and now - changed < _QUIET_S:
+        while (now := time.monotonic()) - start < _LONGEST_S and (
+            now - changed < (_QUIET_S if seen else _EMPTY_S)
+        ):
             self._spin(0.1)
             if (found := self.topics()) != seen:
                 seen, changed = found, now

@@ -17,6 +17,8 @@ _DRIVER_SILENT_S, _NODE_SILENT_S = 1.5, 3.0
 # A node that computes says nothing meanwhile: so long it may be busy [s].
 _BUSY_S = {'identifier': 120.0, 'thermal': 120.0}
 _LONGEST_BUSY_S = 10.0
+# Who must not be silent: what it does not take is lost.
+_NEVER_BUSY = ('recorder',)
 # After a cycle it computes for some seconds; nothing is wrong with that [s].
 _COMPUTES_S = 30.0
 # The rate is that of the last so many seconds.
@@ -129,7 +131,7 @@ def node_health(reports: list[Report], ended: bool, now: float) -> Health:
     if said > _NODE_SILENT_S:
         if name in _BUSY_S and said <= _COMPUTES_S:
             return Health(name, OK, f'computes: silent for {said:.0f} s', None, said)
-        if said <= _BUSY_S.get(name, _LONGEST_BUSY_S):
+        if name not in _NEVER_BUSY and said <= _BUSY_S.get(name, _LONGEST_BUSY_S):
             return Health(name, WARN, f'busy: silent for {said:.0f} s', None, said)
         text = f'silent for {said:.0f} s: the process has ended or hangs'
         return Health(name, ERROR, text, None, said)

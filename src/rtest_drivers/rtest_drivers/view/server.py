@@ -195,7 +195,7 @@ class Server:
             return _refusal(400, 'write what is to be marked')
         if len(text) > MARK_LIMIT or not text.isprintable():
             return _refusal(400, f'a mark has at most {MARK_LIMIT} characters, in one line')
-        if problem := self._state.problem():
+        if problem := self._state.problem(time.monotonic()):
             return web.json_response({'granted': False, 'answer': problem})
         granted, answer = self._mark(text)
         return web.json_response({'granted': granted, 'answer': answer})

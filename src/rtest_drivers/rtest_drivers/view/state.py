@@ -43,9 +43,11 @@ _SESSION, _PROGRESS, _FINISHED = (
 )
 # Lines of the identifier: of the status, what they are numbered as, as which part they are shown.
 _TOLD = {
-    'identifier: session': ('warning', 'warnings'),
-    'identifier: model gap': ('note', 'gap_notes'),
+    'identifier: session': (('warning', 'warnings'), ('note', 'notes')),
+    'identifier: model gap': (('note', 'gap_notes'),),
 }
+# A recorder that says nothing for so long may not record either [s].
+_RECORDER_SILENT_S = 3.0
 _LEVELS = (OK, WARN, ERROR, ERROR)
 # When a session begins, who has spoken in this time belongs to it [s].
 _RECENT_S = 5.0
@@ -145,7 +147,8 @@ class CellState:
         elif report.name == _FINISHED:
             self._explain(report)
         elif report.name in _TOLD:
-            self._tell(report, *_TOLD[report.name])
+            for word, part in _TOLD[report.name]:
+                self._tell(report, word, part)
 
     def add_mark(self, text: str) -> None:
         """A mark that was set in the recording, by this page or by somebody else.
@@ -177,16 +180,18 @@ class CellState:
             ] + [_row(one) for one in self._nodes(ended, now)],
             'gauges': self._gauges.shown(gauges.level),
             'axes': self._axes(cnc.level in (OK, WARN)),
-            'recording': self._recording(),
+            'recording': self._recording(ended, now),
         }
 
-    def problem(self) -> str:
+    def problem(self, now: float) -> str:
         """What keeps a mark from being recorded; '' for nothing."""
         recorder = next((r for r in self._reports.values() if r.source == 'recorder'), None)
         if recorder is None:
             return 'no recorder in the graph'
         if recorder.level >= 2 or recorder.text == 'finished':
             return f'the recorder does not record: {recorder.text}'
+        if now - recorder.heard > _RECORDER_SILENT_S:
+            return f'nothing was heard of the recorder for {now - recorder.heard:.0f} s'
         return ''
 
     # --- parts ---
@@ -302,14 +307,18 @@ class CellState:
             })
         return rows
 
-    def _recording(self) -> dict[str, Any]:
+    def _recording(self, ended: bool, now: float) -> dict[str, Any]:
         report = next((r for r in self._reports.values() if r.source == 'recorder'), None)
         if report is None:
             return {'level': IDLE, 'text': 'no recorder heard yet'}
         keys = ('file', 'bytes', 'disk_free', 'messages', 'lost')
+        level, text, silent = _LEVELS[report.level], report.text, now - report.heard
+        if silent > _RECORDER_SILENT_S and not ended:
+            level = ERROR
+            text = f'nothing heard for {silent:.0f} s: what comes now may be lost; values are old'
         return {
-            'level': _LEVELS[report.level],
-            'text': report.text,
+            'level': level,
+            'text': text,
             **{key: report.values[key] for key in keys if key in report.values},
         }
 

@@ -210,6 +210,8 @@ class IdentifierNode(Node):
         wrong = warnings or (self._problem and (static or self._machine is None))
         level = diagnostics.WARN if wrong else diagnostics.OK
         values = {f'warning {n + 1}': text for n, text in enumerate(warnings)}
+        notes = self._result.notes if self._result else ()
+        values |= {f'note {n + 1}': text for n, text in enumerate(notes)}
         self._diagnostics.publish(
             diagnostics.status('identifier: session', level, self._summary(), values)
         )

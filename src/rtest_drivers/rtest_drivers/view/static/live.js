@@ -17,7 +17,12 @@ function drawSession() {
   const place = session.cycles ? `cycle ${session.cycle} of ${session.cycles}: ` : '';
   set(byId('doing'), place + session.text);
   // What the session waits for stands out.
-  document.querySelector('[data-wish=start]').classList.toggle('chosen', Boolean(session.waits));
+  const start = document.querySelector('[data-wish=start]');
+  start.classList.toggle('chosen', Boolean(session.waits));
+  // What is measured while something does not work is asked for twice.
+  const broken = cell.live.devices.filter((one) => one.level === 'error').map((one) => one.name);
+  if (broken.length) start.dataset.sure = `start although ${broken.join(', ')}: ERROR`;
+  else delete start.dataset.sure;
 }
 
 function drawDevices() {

@@ -3,7 +3,7 @@ import {cell} from './connection.js';
 import {byId, element, number, rows, set} from './dom.js';
 
 // What stands on this card, by names of parts.
-export const RESULTS = ['location', 'warnings', 'gap', 'gap_notes'];
+export const RESULTS = ['location', 'warnings', 'notes', 'gap', 'gap_notes'];
 const LEVELS = {'no gap': 'ok', explained: 'ok', 'partly explained': 'warn'};
 
 export function drawResults() {
@@ -27,6 +27,9 @@ export function drawResults() {
   const list = rows(byId('warnings'), warnings.length, () => element('li'));
   warnings.forEach((text, index) => set(list[index], text));
   byId('warnings').hidden = !warnings.length;
+  const notes = cell.parts.notes || [];
+  rows(byId('notes'), notes.length, () => element('li'))
+    .forEach((one, index) => set(one, notes[index]));
   drawGap();
 }
 
@@ -45,7 +48,8 @@ function drawGap() {
   line.append(element('span', `badge ${LEVELS[gap.verdict] || 'error'}`, gap.verdict));
   const after = gap.effects.length ?
     `; with the effects below ${number(gap.after, 2)} µm` : '; no known effect was added';
-  box.append(line, element('p', 'quiet', `The model leaves ${number(gap.before, 2)} µm rms, ` +
+  box.append(line, element('p', 'quiet', 'The model, location errors ' +
+    `and squareness without error maps, leaves ${number(gap.before, 2)} µm rms, ` +
     `of which ${number(gap.noise, 2)} µm are noise${after}.`));
   const told = paragraphs(cell.parts.gap_notes || []);
   const list = element('ul', 'notes');
