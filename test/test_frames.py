@@ -33,7 +33,9 @@ from rtest_identification.urdf import robot_description
 
 pytestmark = [
     pytest.mark.graph,
-    pytest.mark.skipif(find_spec('tf2_msgs') is None, reason='needs tf2_msgs'),
+    pytest.mark.skipif(
+        find_spec('tf2_msgs') is None, reason='needs tf2_msgs (ros-jazzy-tf2-msgs)'
+    ),
 ]
 
 NMV = config_path('nmv1500dcg.yaml')

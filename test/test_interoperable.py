@@ -106,7 +106,7 @@ def test_metadata_is_what_rosbag2_needs():
     assert not topics
 
 
-@pytest.mark.skipif(find_spec('tf2_msgs') is None, reason='needs tf2_msgs')
+@pytest.mark.skipif(find_spec('tf2_msgs') is None, reason='needs tf2_msgs (ros-jazzy-tf2-msgs)')
 def test_the_message_of_tf_is_that_of_ros():
     name = 'tf2_msgs/msg/TFMessage'
     share = Path(get_package_share_directory('tf2_msgs'))

@@ -86,14 +86,14 @@ def add_run_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run the session, then identify its recording."""
+    """Run the session, then identify its recording, or judge the chain by it."""
     config = (arguments.config or config_path('demo.yaml')).absolute()
     if arguments.moves and not arguments.check:
         raise UserError('--moves: expected together with --check')
-    if arguments.check and not _check(config, arguments):
-        return 1
-    if arguments.check and not _is_chain(config, arguments.check):
-        return 0
+    if arguments.check:
+        right, whole = _check(config, arguments)
+        if not (right and whole):
+            return 0 if right else 1
     settings = GraphSettings(
         config=config,
         session=arguments.session or session_name(config.stem),
@@ -112,30 +112,25 @@ def run(arguments: argparse.Namespace) -> int:
         view_node(*settings.view)
         check_address(*settings.view)
     settings, complete = measure(settings, arguments.domain, bool(arguments.session))
-    if arguments.check:
+    if settings.checks:
         return _judge(settings, complete)
     evaluate(settings, complete)
     return 0
 
 
-def _is_chain(path: Path, check: str) -> bool:
-    """Whether the whole chain is to be checked: the file has the cycles for it."""
-    from rtest_identification.session_file import load_session
+def _check(path: Path, arguments: argparse.Namespace) -> tuple[bool, bool]:
+    """Try the devices of a session file.
 
-    return check == CHAIN and load_session(path).checks
+    A simulated cell has none, and a file that checks the whole chain need not name any.
 
-
-def _check(path: Path, arguments: argparse.Namespace) -> bool:
-    """Try the devices of a session file; whether all are right.
-
-    A simulated cell has none, nor need a file that checks the whole chain name any.
+    Returns whether all are right, and whether the whole chain is to be checked.
     """
     from rtest_drivers.device_check import check_session_devices
     from rtest_drivers.devices import check_devices
     from rtest_identification.session_file import load_session
 
     config = load_session(path)
-    chain = _is_chain(path, arguments.check)
+    chain = arguments.check == CHAIN and config.checks
     example = shown(config_path('check_example.yaml'))
     if arguments.simulate is not None:
         if not chain:
@@ -143,7 +138,7 @@ def _check(path: Path, arguments: argparse.Namespace) -> bool:
                 '--check: a simulated cell has no devices to try; leave --simulate out, or give a '
                 f'session file with cycle: {{kind: check}}, as {example}, to check the whole chain'
             )
-        return True
+        return True, chain
     if not config.devices and not chain:
         raise UserError(f'{path}: devices: missing, --check tries what it names')
     check_devices(config, path)
@@ -156,7 +151,7 @@ def _check(path: Path, arguments: argparse.Namespace) -> bool:
     if config.devices:
         print(f'{shown(path)}: '
               + (f'{len(wrong)} found wrong' if wrong else 'every device answers'))
-    return not wrong
+    return not wrong, chain
 
 
 def _judge(settings: GraphSettings, complete: bool) -> int:
@@ -169,10 +164,7 @@ def _judge(settings: GraphSettings, complete: bool) -> int:
     except UserError as error:
         raise NodeFailed(f'{error}\n  recorded: {shown(settings.recording)}') from None
     if not complete:
-        raise NodeFailed(
-            f'session {settings.session} is incomplete, see above; the verdicts are of what there '
-            f'is; to judge it again: rtest check {shlex.quote(shown(settings.folder))}'
-        )
+        raise _incomplete(settings, 'the verdicts are of what there is; to judge it again')
     return wrong
 
 
@@ -235,11 +227,14 @@ def evaluate(settings: GraphSettings, complete: bool) -> Path:
     except UserError as error:
         raise NodeFailed(f'{error}\n  recorded: {shown(settings.recording)}') from None
     if not complete:
-        raise NodeFailed(
-            f'session {settings.session} is incomplete, see above; the report holds what there '
-            f'is; to identify it again: {_again(settings)}'
-        )
+        raise _incomplete(settings, 'the report holds what there is; to identify it again')
     return result
+
+
+def _incomplete(settings: GraphSettings, what: str) -> NodeFailed:
+    return NodeFailed(
+        f'session {settings.session} is incomplete, see above; {what}: {_again(settings)}'
+    )
 
 
 def _again(settings: GraphSettings) -> str:

@@ -13,6 +13,9 @@ from rtest_drivers.complaints import Complaints
 from rtest_drivers.nodes.session_voice import Voice
 from rtest_estimation.nodes import diagnostics
 
+# A driver tells its state as often [s].
+HEARD_S = 1.0
+
 
 class Heard:
     """What drivers and estimator said last; tells their complaints.

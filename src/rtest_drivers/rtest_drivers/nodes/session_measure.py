@@ -10,7 +10,7 @@ from pathlib import Path
 
 from rtest_drivers.cnc.programs import program_of, start_program
 from rtest_drivers.nodes.session_cycles import Cycles, Key
-from rtest_drivers.nodes.session_heard import Heard
+from rtest_drivers.nodes.session_heard import HEARD_S, Heard
 from rtest_drivers.nodes.session_voice import Voice
 from rtest_drivers.nodes.session_waiting import SessionError, Wait
 from rtest_drivers.schedule import NANOSECONDS, STOPPED_S, Progress
@@ -23,8 +23,6 @@ from rtest_identification.session_file import BY_HAND, UNATTENDED, Device
 PROGRESS_S, SLOW_PROGRESS_S = 2.0, 10.0
 # A simulated clock that stands still this long has lost its cell [s].
 CLOCK_TIMEOUT_S = 30.0
-# The CNC driver tells its state as often, twice over [s].
-HEARD_S = 1.0
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from lifecycle_msgs.srv import ChangeState, GetState
 from rclpy.node import Node
 from std_srvs.srv import Trigger
 
-from rtest_drivers.nodes.session_heard import Heard
+from rtest_drivers.nodes.session_heard import HEARD_S, Heard
 from rtest_drivers.nodes.session_voice import Voice
 from rtest_drivers.nodes.session_waiting import SessionError, Wait
 from rtest_estimation.errors import UserError
@@ -22,8 +22,6 @@ STREAMS = ('rtest/gauges', 'rtest/cnc/feedback')
 SERVICE_TIMEOUT_S = 120.0
 # After this time an answer is taken for lost [s].
 ANSWER_S = 5.0
-# A driver tells its state as often [s].
-HEARD_S = 1.0
 _REACHED = {
     Transition.TRANSITION_CONFIGURE: State.PRIMARY_STATE_INACTIVE,
     Transition.TRANSITION_ACTIVATE: State.PRIMARY_STATE_ACTIVE,
@@ -182,8 +180,7 @@ class Partners:
 
         Raises SessionError where a node does not answer.
         """
-        # All at once: a dwell that has no end is taken to be at the end of the feedback, and needs
-        # readings there; and feedback that ends before the readings is stale.
+        # All at once, so that feedback and readings end together as well as they can.
         request = ChangeState.Request(transition=Transition(id=Transition.TRANSITION_DEACTIVATE))
         asked = {name: self._change[name].call_async(request) for name in reversed(self._drivers)}
         for name, future in asked.items():

@@ -48,8 +48,8 @@ function drawGap() {
   line.append(element('span', `badge ${LEVELS[gap.verdict] || 'error'}`, gap.verdict));
   const after = gap.effects.length ?
     `; with the effects below ${number(gap.after, 2)} µm` : '; no known effect was added';
-  box.append(line, element('p', 'quiet', 'The model, location errors ' +
-    `and squareness without error maps, leaves ${number(gap.before, 2)} µm rms, ` +
+  box.append(line, element('p', 'quiet',
+    `The model, which has no error maps, leaves ${number(gap.before, 2)} µm rms, ` +
     `of which ${number(gap.noise, 2)} µm are noise${after}.`));
   const told = paragraphs(cell.parts.gap_notes || []);
   const list = element('ul', 'notes');
